@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from hyperplanes.data.formats.npz import read_arrays
-from hyperplanes.data.pictures.frames import Frame, Listing
+from hyperplanes.data.pictures.frames import Frame, Listing, scaled_matrix
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES, image_size
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.geometry.rays import Sphere
@@ -56,14 +56,10 @@ def read_idr(folder: Path, root: Path) -> Listing:
     frames = []
     for index, (path, mask) in enumerate(zip(pictures, masks, strict=True)):
         matrix, pose = _decomposed(arrays, index, source)
-        frames.append(
-            Frame(path, path.relative_to(folder).as_posix(), pose, _fixed(matrix), image_size(path), mask=mask)
-        )
+        size = image_size(path)
+        calibrate = partial(scaled_matrix, matrix, size)
+        frames.append(Frame(path, path.relative_to(folder).as_posix(), pose, calibrate, size, mask=mask))
     return Listing(frames, source, bounds=Sphere())
-
-
-def _fixed(matrix: npt.NDArray[np.float64]) -> Callable[[tuple[int, int]], npt.NDArray[np.float64]]:
-    return lambda _: matrix
 
 
 def _decomposed(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.pictures.frames import Frame, Listing
+from hyperplanes.data.pictures.frames import Frame, Listing, centred_matrix
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import check_pose
@@ -61,25 +62,13 @@ def read_llff(folder: Path, root: Path) -> Listing:
                 path,
                 path.relative_to(folder).as_posix(),
                 invert_poses(world_from_camera),
-                _Calibration(width, focal),
+                partial(centred_matrix, focal / width),
                 (round(height), round(width)),
                 mask=mask,
                 depths=(float(near), float(far)) if 0 < near < far < np.inf else None,
             )
         )
     return Listing(frames, source)
-
-
-class _Calibration:
-    """The calibration of a picture whose principal point is its middle."""
-
-    def __init__(self, width: float, focal: float) -> None:
-        self.relative = focal / width
-
-    def __call__(self, size: tuple[int, int]) -> npt.NDArray[np.float64]:
-        height, width = size
-        focal = self.relative * width
-        return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
 
 
 def _rows(source: Path, root: Path) -> npt.NDArray[np.float64]:

@@ -7,6 +7,7 @@ cameras.npz: world_mat_i is camera_from_world in OpenCV axes, camera_mat_i proje
 from __future__ import annotations
 
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from hyperplanes.data.formats.catalogue import SPLITS, Catalogue, is_plain
 from hyperplanes.data.formats.npz import read_arrays
 from hyperplanes.data.formats.text_numbers import LARGEST_TEXT
-from hyperplanes.data.pictures.frames import Frame, Listing, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing, assemble, scaled_matrix
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import PosedTask, check_pose
@@ -61,8 +62,9 @@ def read_nmr(folder: Path, root: Path) -> Listing:
     frames = []
     for index, (path, mask) in enumerate(zip(pictures, masks, strict=True)):
         pose = check_pose(_matrix(arrays, f"world_mat_{index}", source), source, path.name)
-        focal = np.abs(np.diagonal(_matrix(arrays, f"camera_mat_{index}", source))[:2]).astype(np.float64)
-        frames.append(Frame(path, f"image/{path.name}", pose, _Calibration(focal), mask=mask))
+        x, y = np.abs(np.diagonal(_matrix(arrays, f"camera_mat_{index}", source))[:2]).astype(np.float64)
+        matrix = np.array([[x, 0.0, 0.5], [0.0, y, 0.5], [0.0, 0.0, 1.0]])  # of a picture of 2 x 2 pixels
+        frames.append(Frame(path, f"image/{path.name}", pose, partial(scaled_matrix, matrix, (2, 2)), mask=mask))
     return Listing(frames, source)
 
 
@@ -109,18 +111,6 @@ def _lists(folder: Path) -> dict[str, Path]:
     """The lists of objects in the folder of a class, by split."""
     paths = {split: folder / LISTS.format(split=split) for split in SPLITS}
     return {split: path for split, path in paths.items() if path.is_file()}
-
-
-class _Calibration:
-    """The calibration of a picture from focal lengths in halves of its width and of its height."""
-
-    def __init__(self, focal: npt.NDArray[np.float64]) -> None:
-        self.focal = focal
-
-    def __call__(self, size: tuple[int, int]) -> npt.NDArray[np.float64]:
-        height, width = size
-        x, y = self.focal * [width / 2, height / 2]
-        return np.array([[x, 0.0, (width - 1) / 2], [0.0, y, (height - 1) / 2], [0.0, 0.0, 1.0]])
 
 
 def _matrix(arrays: dict[str, npt.NDArray[np.float64]], name: str, source: Path) -> npt.NDArray[np.float64]:

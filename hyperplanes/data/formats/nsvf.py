@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from hyperplanes.data.formats.text_numbers import read_numbers, read_rows
-from hyperplanes.data.pictures.frames import Frame, Listing, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing, assemble, scaled_matrix
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.posed import PosedTask, check_pose
 from hyperplanes.geometry.rays import Sphere
@@ -46,13 +47,12 @@ def read_nsvf(folder: Path, root: Path) -> Listing:
     if not pictures:
         raise DataError(folder / "rgb", "pictures", "none", _REMEDY)
     matrix, size = _intrinsics(folder / "intrinsics.txt", root)
+    calibrate = (lambda _: matrix) if size is None else partial(scaled_matrix, matrix, size)
     frames = []
     for path in pictures:
         pose_file = folder / "pose" / f"{path.stem}.txt"
         world_from_camera = check_pose(read_numbers(pose_file, [16], root).reshape(4, 4), pose_file, path.stem)
-        frames.append(
-            Frame(path, f"rgb/{path.name}", invert_poses(world_from_camera), _Calibration(matrix, size), size)
-        )
+        frames.append(Frame(path, f"rgb/{path.name}", invert_poses(world_from_camera), calibrate, size))
     return Listing(frames, folder, bounds=_box(folder / "bbox.txt", root))
 
 
@@ -69,22 +69,8 @@ def read_nsvf_task(folder: Path, name: str, downscale: int | None, root: Path) -
     return PosedTask.split(scene, splits[0], query, name)
 
 
-class _Calibration:
-    """The calibration for pictures of a size, from one for another size, or for the same where that is not stated."""
-
-    def __init__(self, matrix: npt.NDArray[np.float64], size: tuple[int, int] | None) -> None:
-        self.matrix, self.size = matrix, size
-
-    def __call__(self, size: tuple[int, int]) -> npt.NDArray[np.float64]:
-        stated = self.size or size
-        result = self.matrix.copy()
-        result[:2] *= np.array([size[1] / stated[1], size[0] / stated[0]])[:, None]
-        result[:2, 2] -= 0.5
-        return result
-
-
 def _intrinsics(path: Path, root: Path) -> tuple[npt.NDArray[np.float64], tuple[int, int] | None]:
-    """The calibration, the principal point from the borders, and (height, width) where the file states it."""
+    """The calibration, integer pixel centres, and (height, width) where the file states it."""
     lines = read_rows(path, "a calibration in numbers", root)
     size = None
     values = np.array([value for line in lines for value in line])
@@ -102,6 +88,7 @@ def _intrinsics(path: Path, root: Path) -> tuple[npt.NDArray[np.float64], tuple[
     if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise DataError(path, "finite numbers and positive focal lengths", f"{matrix.tolist()}", _REMEDY)
     matrix[2] = [0.0, 0.0, 1.0]
+    matrix[:2, 2] -= 0.5
     return matrix, size
 
 

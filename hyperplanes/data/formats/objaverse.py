@@ -12,15 +12,15 @@ import io
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from hyperplanes.data.formats.catalogue import Catalogue, is_plain
 from hyperplanes.data.formats.transforms_json import read_transforms
-from hyperplanes.data.pictures.frames import Frame, Listing, assemble
+from hyperplanes.data.pictures.frames import Frame, Listing, assemble, centred_matrix
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.axes import flip_camera_axes
@@ -62,7 +62,7 @@ def read_rendered(folder: Path, root: Path) -> Listing:
         except (*MALFORMED, OSError) as error:
             raise DataError(camera, "an array (3, 4)", str(error), _REMEDY) from error
         pose = check_pose(matrix, camera, path.name)
-        frames.append(Frame(path, path.name, flip_camera_axes(pose.T).T, _calibration))
+        frames.append(Frame(path, path.name, flip_camera_axes(pose.T).T, partial(centred_matrix, FOCAL)))
     return Listing(frames, folder, bounds=CUBE)
 
 
@@ -153,9 +153,3 @@ def omniobject(folder: Path) -> Catalogue | None:
         return PosedTask.alternating(read_omniobject(where[name], None, folder), name)
 
     return Catalogue("omniobject3d", splits, read, {"objects": classes})
-
-
-def _calibration(size: tuple[int, int]) -> npt.NDArray[np.float64]:
-    height, width = size
-    focal = FOCAL * width
-    return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])

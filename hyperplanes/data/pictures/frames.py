@@ -28,7 +28,7 @@ from hyperplanes.data.pictures.undistort import check_lens, undistort
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "listed", "scaled_matrix"]
+__all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "centred_matrix", "listed", "scaled_matrix"]
 
 MEGAPIXEL = 2**20
 """Pixels above which photographs are scaled down unless the caller says by how much."""
@@ -264,6 +264,20 @@ def scaled_matrix(
     result[:2, :2] *= scale[:, None]
     result[:2, 2] = scale * (matrix[:2, 2] + 0.5) - 0.5
     return result
+
+
+def centred_matrix(focal: float, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """The calibration, integer pixel centres, of a picture of (height, width) whose principal point is its middle.
+
+    Args:
+        focal: focal length in widths of the picture.
+        size: of the picture.
+
+    >>> centred_matrix(0.5, (2, 4)).tolist()
+    [[2.0, 0.0, 1.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]
+    """
+    height, width = size
+    return np.array([[focal * width, 0.0, (width - 1) / 2], [0.0, focal * width, (height - 1) / 2], [0.0, 0.0, 1.0]])
 
 
 def _pixels(one: _Found, size: tuple[int, int], factor: int) -> tuple[Pixels, bool]:
