@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from kornia.feature import gftt_response
 from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.epipolar import cross_product_matrix, sampson_epipolar_distance
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, max_pool2d, normalize
 
@@ -102,16 +103,12 @@ def sampson(
         second_from_first: rigid transform between the cameras.
 
     Returns:
-        How far each pair is from being the image of one point, to first order; NaN where the cameras coincide.
+        How far each pair is from being the image of one point, to first order; not finite where the cameras coincide.
     """
-    rotation, (x, y, z) = second_from_first[:, :3, :3], second_from_first[:, :3, 3].unbind(1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
-    fundamental = torch.linalg.inv(second).mT @ cross @ rotation @ torch.linalg.inv(first)
-    ones = pixels.new_ones(len(pixels), 1)
-    here, there = torch.cat([pixels[:, 0], ones], 1), torch.cat([pixels[:, 1], ones], 1)
-    line, other = (fundamental @ here[..., None])[..., 0], (fundamental.mT @ there[..., None])[..., 0]
-    return (there * line).sum(1).abs() / (line[:, :2].square().sum(1) + other[:, :2].square().sum(1)).sqrt()
+    essential = cross_product_matrix(second_from_first[:, :3, 3]) @ second_from_first[:, :3, :3]
+    fundamental = torch.linalg.inv(second).mT @ essential @ torch.linalg.inv(first)
+    # eps, which releases before 0.9 add to the square, would hide small errors
+    return sampson_epipolar_distance(pixels[:, :1], pixels[:, 1:], fundamental, squared=False, eps=0.0)[:, 0]
 
 
 def _corners(image: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
