@@ -7,7 +7,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import chain, count
 from pathlib import Path
@@ -230,17 +230,9 @@ def _with_one_shape(photographs: list[Photograph]) -> list[Photograph]:
     across: dict[str, Counter[bool]] = {}
     for one in photographs:
         across.setdefault(one.camera, Counter())[one.size[1] > one.size[0]] += 1
+    usual = {camera: counts.most_common(1)[0][0] for camera, counts in across.items()}
     return [
-        Photograph(
-            one.path,
-            one.name,
-            one.size,
-            one.orientation,
-            one.camera,
-            one.focal,
-            one.size[0] != one.size[1] and (one.size[1] > one.size[0]) != across[one.camera].most_common(1)[0][0],
-            one.mask,
-        )
+        replace(one, turned=one.size[0] != one.size[1] and (one.size[1] > one.size[0]) != usual[one.camera])
         for one in photographs
     ]
 

@@ -194,14 +194,11 @@ def _camera(model: str, width: int, height: int, values: list[float], path: Path
 
 
 def _pose(quaternion: npt.NDArray[np.float64], translation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    """camera_from_world of a quaternion w, x, y, z and a translation."""
+    from scipy.spatial.transform import Rotation
+
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    pose[:3, 3] = translation
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix(), translation
     return pose
 
 
