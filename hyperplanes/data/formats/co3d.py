@@ -10,7 +10,6 @@ from __future__ import annotations
 import gzip
 import json
 import os
-import zlib
 from collections import defaultdict
 from functools import partial
 from pathlib import Path
@@ -126,7 +125,7 @@ def _annotations(path: Path) -> dict[str, list[dict[str, Any]]]:
             frames.sort(key=lambda frame: frame["frame_number"])
     except DataError:
         raise
-    except (*MALFORMED, OSError, zlib.error) as error:
+    except (*MALFORMED, OSError) as error:
         raise DataError(path, "a list of frames, compressed by gzip", f"{error}"[:200], _REMEDY) from error
     return dict(sequences)
 

@@ -15,7 +15,7 @@ from hyperplanes.data.pictures.frames import Frame, Listing, scaled_matrix
 from hyperplanes.data.pictures.images import image_size
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import check_pose
-from hyperplanes.utilities.files import DataError, check_link, inside, read_bytes, read_text
+from hyperplanes.utilities.files import DataError, check_link, inside, malformed, read_bytes, read_text
 
 __all__ = ["find_model", "image_names", "read_colmap"]
 
@@ -31,7 +31,6 @@ _MODELS = {
 _PARAMETERS = dict(_MODELS.values())
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _PLACES = ("sparse", "dense/sparse", "dense", "distorted/sparse", "colmap/sparse", "colmap")
-_REMEDY = "export the model again with COLMAP"
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ def read_colmap(folder: Path, root: Path) -> Listing:
     images = sorted(images, key=lambda image: image.name)
     absent = [image.name for image in images if image.camera not in cameras]
     if absent:
-        raise DataError(paths[0], f"the camera of {absent[0]}", "none", _REMEDY)
+        raise DataError(paths[0], f"the camera of {absent[0]}", "none", "export the model again with COLMAP")
     home = _pictures_folder(folder, model, images, cameras, paths[1], root)
     frames = []
     for image in images:
@@ -135,14 +134,10 @@ def _read(model: Path, root: Path) -> tuple[tuple[Path, Path], dict[int, _Camera
     paths = model / f"cameras{suffix}", model / f"images{suffix}"
     for path in paths:
         check_link(path, root)
-    try:
+    with malformed(model, "a whole COLMAP model"):
         if binary:
             return paths, _cameras_binary(paths[0]), _images_binary(paths[1])
         return paths, _cameras_text(paths[0]), _images_text(paths[1])
-    except DataError:
-        raise
-    except (struct.error, IndexError, UnicodeDecodeError, ValueError) as error:
-        raise DataError(model, "a whole COLMAP model", f"a broken one ({error})", _REMEDY) from error
 
 
 def _picture(home: Path, name: str, source: Path, root: Path) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from functools import partial
 from pathlib import Path
@@ -10,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from hyperplanes.data.formats.npz import read_array
 from hyperplanes.data.pictures.frames import Frame, Listing, centred_matrix
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import check_pose
 from hyperplanes.utilities.axes import invert_poses
-from hyperplanes.utilities.files import MALFORMED, DataError, list_files, read_bytes
+from hyperplanes.utilities.files import DataError, list_files
 
 __all__ = ["FILE", "is_llff", "read_llff"]
 
@@ -72,12 +72,7 @@ def read_llff(folder: Path, root: Path) -> Listing:
 
 
 def _rows(source: Path, root: Path) -> npt.NDArray[np.float64]:
-    try:
-        rows = np.load(io.BytesIO(read_bytes(source, LARGEST_FILE, root)), allow_pickle=False)
-    except DataError:
-        raise
-    except MALFORMED + (OSError,) as error:
-        raise DataError(source, "an array of numbers", str(error), "write or download it again") from error
+    rows = read_array(source, "an array of numbers", LARGEST_FILE, root)
     if (
         not isinstance(rows, np.ndarray)
         or rows.ndim != 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import zipfile
 from pathlib import Path
@@ -17,9 +18,9 @@ from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.frames import assemble
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import MALFORMED, DataError, check_regular, read_json
+from hyperplanes.utilities.files import MALFORMED, DataError, check_regular, malformed, read_bytes, read_json
 
-__all__ = ["AUTHORS_FOCAL", "LEGACY", "catalogue", "read_arrays", "read_npz"]
+__all__ = ["AUTHORS_FOCAL", "LEGACY", "catalogue", "read_array", "read_arrays", "read_npz"]
 
 AUTHORS_FOCAL = 277.77
 """Focal length in pixels of the authors' 200x200 pictures: Blender's 50 mm on 36 mm."""
@@ -111,6 +112,12 @@ def read_arrays(path: str | Path, names: set[str], root: Path | None = None) -> 
         raise
     except MALFORMED + (OSError,) as error:
         raise DataError(path, "an .npz file of plain arrays", str(error), "write or download it again") from error
+
+
+def read_array(path: Path, expected: str, largest: int, root: Path) -> npt.NDArray[Any]:
+    """The content of an .npy file of so many bytes at most; what is broken, or a pickle, is a DataError."""
+    with malformed(path, expected):
+        return np.load(io.BytesIO(read_bytes(path, largest, root)), allow_pickle=False)
 
 
 def _claimed_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:

@@ -8,23 +8,22 @@ first three objects of a category are kept to test on, as in the authors' benchm
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from hyperplanes.data.formats.catalogue import Catalogue, is_plain
+from hyperplanes.data.formats.npz import read_array
 from hyperplanes.data.formats.transforms_json import read_transforms
 from hyperplanes.data.pictures.frames import Frame, Listing, assemble, centred_matrix
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.axes import flip_camera_axes
-from hyperplanes.utilities.files import MALFORMED, DataError, list_files, read_bytes, read_text
+from hyperplanes.utilities.files import DataError, list_files, malformed, read_text
 
 __all__ = ["is_omniobject", "is_rendered", "objaverse", "omniobject", "read_omniobject", "read_rendered"]
 
@@ -53,15 +52,9 @@ def read_rendered(folder: Path, root: Path) -> Listing:
     frames = []
     for path in list_files(folder, {".png"}, root):
         camera = path.with_suffix(".npy")
-        try:
-            matrix = np.load(io.BytesIO(read_bytes(camera, _LARGEST_ARRAY, root)), allow_pickle=False)
-        except DataError:
-            raise
-        except FileNotFoundError as error:
-            raise DataError(camera, f"the camera of {path.name}", "nothing", _REMEDY) from error
-        except (*MALFORMED, OSError) as error:
-            raise DataError(camera, "an array (3, 4)", str(error), _REMEDY) from error
-        pose = check_pose(matrix, camera, path.name)
+        if not camera.exists():
+            raise DataError(camera, f"the camera of {path.name}", "nothing", _REMEDY)
+        pose = check_pose(read_array(camera, "an array (3, 4)", _LARGEST_ARRAY, root), camera, path.name)
         frames.append(Frame(path, path.name, flip_camera_axes(pose.T).T, partial(centred_matrix, FOCAL)))
     return Listing(frames, folder, bounds=CUBE)
 
@@ -83,10 +76,8 @@ def objaverse(folder: Path) -> Catalogue | None:
         return None
     splits, skipped = {"train": (), "val": (), "test": tuple(names)}, ()
     if (path := folder / VALID).is_file():
-        try:
+        with malformed(path, "a list of names"):
             listed = json.loads(read_text(path, root=folder))
-        except (ValueError, RecursionError) as error:
-            raise DataError(path, "a list of names", str(error), _REMEDY) from error
         if not isinstance(listed, list) or not all(isinstance(name, str) and is_plain(name) for name in listed):
             raise DataError(path, "a list of plain names of folders", repr(listed)[:60], "correct the list")
         cut = math.floor(len(listed) / 100 * 99)

@@ -15,7 +15,7 @@ from hyperplanes.data.pictures.images import image_size, read_image
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.axes import invert_poses
-from hyperplanes.utilities.files import DataError, list_files
+from hyperplanes.utilities.files import DataError, list_files, malformed
 
 __all__ = ["catalogue", "is_srn", "read_srn"]
 
@@ -124,11 +124,9 @@ def _white_border(picture: npt.NDArray[np.uint8]) -> bool:
 def _intrinsics(path: Path, size: tuple[int, int], root: Path) -> npt.NDArray[np.float64]:
     expected = "f cx cy first and height width last"
     lines = read_rows(path, expected, root)
-    try:
+    with malformed(path, expected):
         focal, centre_x, centre_y = lines[0][:3]
         height, width = (lines[4] if len(lines) > 4 else lines[-1])[:2]
-    except (ValueError, IndexError) as error:
-        raise DataError(path, expected, str(error), "download it again") from error
     if not np.isfinite([focal, centre_x, centre_y, height, width]).all() or min(focal, height, width) <= 0:
         raise DataError(path, "finite and positive numbers", f"{lines}", "download it again")
     scale = np.array([size[1] / width, size[0] / height])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.utilities.files import DataError, read_text
+from hyperplanes.utilities.files import DataError, malformed, read_text
 
 __all__ = ["LARGEST_TEXT", "read_numbers", "read_rows"]
 
@@ -32,15 +32,11 @@ def read_rows(path: Path, expected: str, root: Path | None = None) -> list[list[
     Raises:
         DataError: no such file, not a regular one, too large, or something else than numbers.
     """
-    try:
+    if not path.exists():
+        raise DataError(path, expected, "nothing", _REMEDY)
+    with malformed(path, expected):
         lines = read_text(path, LARGEST_TEXT, root).splitlines()
         return [[float(word) for word in line.split()] for line in lines if line.strip()]
-    except DataError:
-        raise
-    except FileNotFoundError as error:
-        raise DataError(path, expected, "nothing", _REMEDY) from error
-    except (OSError, ValueError) as error:
-        raise DataError(path, expected, str(error), _REMEDY) from error
 
 
 def read_numbers(path: Path, counts: Sequence[int], root: Path | None = None) -> npt.NDArray[np.float64]:
