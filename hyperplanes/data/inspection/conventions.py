@@ -119,7 +119,7 @@ def check_conventions(views: Views) -> Conventions:
         return _by_pictures(views, f"fewer than {FEWEST_VIEWS} views are too few to compare masks")
     masks, cameras = small_masks(views)
     readings = {name: camera.with_poses(cameras, pose) for name, pose in _readings(cameras).items()}
-    scores = {name: coarse_hull(masks, turned).overlap(masks, turned) for name, turned in readings.items()}
+    scores = {name: float(coarse_hull(masks, each).overlap(masks, each).mean()) for name, each in readings.items()}
     declared = readings[AS_DECLARED]
     coverage = coarse_hull(masks, declared).coverage(masks, declared)
     return Conventions(scores, _clearly_best(scores), coverage=coverage)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from hyperplanes.data.formats.sparse_points import SparsePoints
-from hyperplanes.data.inspection.silhouettes import masks_tell, silhouettes
+from hyperplanes.data.inspection.silhouettes import CoarseHull, masks_tell, small_masks
 from hyperplanes.data.pictures.bounds import are_inverted, cut_off
 from hyperplanes.data.upright import guess_up, upright
 from hyperplanes.geometry import cameras as camera
@@ -174,7 +174,9 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
     azimuth, elevation = _angles(axes)
     # how each mask fits the hull of all, how sharp each picture is, how well each is posed
     hull = _hull(views)
-    agreement = None if hull is None else _agreement(views, hull)
+    agreement = None
+    if hull is not None:
+        agreement = CoarseHull(hull.centres(), hull).overlap(*small_masks(views, MASK, len(views)))
     middle = None if agreement is None else float(agreement.median())
     sharp = _sharpness(views, apart)
     cut = cut_off(views.masks) if views.masks is not None else torch.zeros(len(views), dtype=torch.bool)
@@ -258,30 +260,12 @@ def _gap(azimuth: Tensor, elevation: Tensor, names: tuple[str, ...]) -> tuple[fl
     return float(widths[widest]), names[int(order[widest])], names[int(order[(widest + 1) % len(order)])]
 
 
-def _small(views: Views) -> tuple[Float[Tensor, "view 1 height width"], camera.PinholeCamera]:
-    assert views.masks is not None
-    factor = MASK / max(views.size)
-    if factor >= 1:
-        return views.masks, views.cameras
-    size = max(1, round(views.size[0] * factor)), max(1, round(views.size[1] * factor))
-    return (interpolate(views.masks, size, mode="area") > 0.2).float(), camera.resized(views.cameras, *size)
-
-
 def _hull(views: Views) -> Occupancy | None:
     """The hull of all masks but for what only one of them rules out; None without masks."""
     if not masks_tell(views):
         return None
-    masks, cameras = _small(views)
-    hull = carve(masks, cameras, views.bounds, SIDE, votes=2 if len(views) >= FEWEST else 1)
+    hull = carve(*small_masks(views, MASK, len(views)), views.bounds, SIDE, votes=2 if len(views) >= FEWEST else 1)
     return hull if hull.occupied.any() else None
-
-
-def _agreement(views: Views, hull: Occupancy) -> Float[Tensor, " view"]:
-    """Intersection over union of each mask and the hull's silhouette."""
-    masks, cameras = _small(views)
-    seen, wanted = silhouettes(hull.centres(), hull, cameras), masks[:, 0] > 0
-    union = (seen | wanted).flatten(1).sum(1).clamp_min(1)
-    return (seen & wanted).flatten(1).sum(1) / union
 
 
 def _shown(views: Views, hull: Occupancy) -> Float[Tensor, " place"]:

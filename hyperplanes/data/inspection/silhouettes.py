@@ -35,13 +35,13 @@ class CoarseHull:
     points: Float[Tensor, "voxel 3"]
     grid: Occupancy | None
 
-    def overlap(self, masks: Float[Tensor, "view 1 height width"], cameras: PinholeCamera) -> float:
-        """Mean intersection over union of masks with the silhouettes of the hull."""
+    def overlap(self, masks: Float[Tensor, "view 1 height width"], cameras: PinholeCamera) -> Float[Tensor, " view"]:
+        """Intersection over union of each mask with the silhouette of the hull."""
         if self.grid is None:
-            return 0.0
+            return torch.zeros(len(masks))
         seen, wanted = silhouettes(self.points, self.grid, cameras), masks[:, 0] > 0
         union = (seen | wanted).flatten(1).sum(1)
-        return float(((seen & wanted).flatten(1).sum(1) / union.clamp_min(1)).mean())
+        return (seen & wanted).flatten(1).sum(1) / union.clamp_min(1)
 
     def coverage(self, masks: Float[Tensor, "view 1 height width"], cameras: PinholeCamera) -> float:
         """How much of each mask the hull's silhouette covers, on average: nearly all with right poses."""
@@ -96,13 +96,17 @@ def masks_tell(views: Views) -> bool:
     return views.masks is not None and 0 < float((views.masks > 0).float().mean()) < 0.95
 
 
-def small_masks(views: Views) -> tuple[Float[Tensor, "view 1 height width"], PinholeCamera]:
-    """Masks of up to MOST_VIEWS views, spread over all, at up to MASK pixels, with their cameras."""
+def small_masks(
+    views: Views, pixels: int = MASK, most: int = MOST_VIEWS
+) -> tuple[Float[Tensor, "view 1 height width"], PinholeCamera]:
+    """Masks of up to so many views, spread over all, at up to so many pixels a side, with their cameras."""
     assert views.masks is not None
-    chosen = torch.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().long()
-    masks, cameras = views.masks[chosen], camera.select(views.cameras, chosen)
+    masks, cameras = views.masks, views.cameras
+    if len(views) > most:
+        chosen = torch.linspace(0, len(views) - 1, most).round().long()
+        masks, cameras = masks[chosen], camera.select(cameras, chosen)
     height, width = masks.shape[2:]
-    factor = MASK / max(height, width)
+    factor = pixels / max(height, width)
     if factor >= 1:
         return masks, cameras
     size = max(1, round(height * factor)), max(1, round(width * factor))
