@@ -30,6 +30,7 @@ EXHAUSTIVE = 80
 OVERLAP = 10  # neighbours of a picture in a sequence that it is matched with
 CLOSING = 40  # pictures, evenly spread, that are matched with each other to close loops
 SMALLEST_MODEL = 3  # pictures
+SEED = 0  # of the random choices
 FEATURES_AT_ONCE, PAIRS_AT_ONCE = 8, 150
 
 
@@ -92,10 +93,9 @@ def find_poses(
     folder: Path,
     database: Path,
     *,
-    features: Features = ATTEMPTS[0],
-    sequential: bool = False,
-    progress: Progress | None = None,
-    seed: int = 0,
+    features: Features,
+    sequential: bool,
+    progress: Progress,
 ) -> SparseModel | None:
     """The poses of pictures: the largest of the models that structure from motion arrives at.
 
@@ -106,18 +106,16 @@ def find_poses(
         features: how features are extracted.
         sequential: match neighbours in the sequence, and some pictures from all of it, rather than all pairs.
         progress: called as it goes on.
-        seed: of the random choices.
 
     Returns:
         The model in COLMAP's world, or None where no two pictures could be registered.
     """
     pycolmap = require("pycolmap", "finds camera poses")
-    progress = progress or (lambda stage, done, total, text: None)
     with _quiet(pycolmap):
-        pycolmap.set_random_seed(seed)
+        pycolmap.set_random_seed(SEED)
         _extract(pycolmap, pictures, folder, database, features, progress)
         _match(pycolmap, pictures, database, sequential, progress)
-        found = _map(pycolmap, len(pictures), folder, database, progress, seed)
+        found = _map(pycolmap, len(pictures), folder, database, progress)
     if not found:
         return None
     largest = max(found, key=lambda model: (model.num_reg_images(), model.num_points3D()))
@@ -199,10 +197,10 @@ def _match(pycolmap: Any, pictures: Sequence[Picture], database: Path, sequentia
     progress("matches", len(pairs), len(pairs), "pairs of pictures")
 
 
-def _map(pycolmap: Any, count: int, folder: Path, database: Path, progress: Progress, seed: int) -> list[Any]:
+def _map(pycolmap: Any, count: int, folder: Path, database: Path, progress: Progress) -> list[Any]:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = _threads()
-    options.random_seed = seed
+    options.random_seed = SEED
     options.min_model_size = SMALLEST_MODEL
     options.extract_colors = True
     registered = 0

@@ -57,7 +57,7 @@ LAYOUTS = (
         lambda folder, name, downscale, root: read_transforms_task(folder, name, downscale=downscale, root=root),
     ),
     _layout(nsvf.is_nsvf, nsvf.read_nsvf, nsvf.read_nsvf_task),
-    Layout(srn.is_srn, lambda folder, downscale, root: srn.read_srn(folder, root=root).downscaled(downscale)),
+    Layout(srn.is_srn, lambda folder, downscale, root: srn.read_srn(folder, root).downscaled(downscale)),
     _layout(colmap.find_model, colmap.read_colmap),
     _layout(llff.is_llff, llff.read_llff),
     _layout(nmr.is_nmr, nmr.read_nmr),

@@ -27,7 +27,7 @@ def is_srn(folder: Path) -> bool:
     return (folder / "intrinsics.txt").is_file() and (folder / "rgb").is_dir() and (folder / "pose").is_dir()
 
 
-def read_srn(folder: str | Path, *, bounds: Sphere | None = None, root: Path | None = None) -> Posed:
+def read_srn(folder: Path, root: Path, bounds: Sphere | None = None) -> Posed:
     """The posed pictures of one object.
 
     Poses are OpenCV camera-to-world. The pictures have no alpha: where every pixel of their border is white, masks are
@@ -37,8 +37,8 @@ def read_srn(folder: str | Path, *, bounds: Sphere | None = None, root: Path | N
 
     Args:
         folder: with intrinsics.txt, rgb and pose.
+        root: no file may lie outside of it, symbolic links followed.
         bounds: of the scene; estimated when None.
-        root: no file may lie outside of it, symbolic links followed; the folder when None.
 
     Returns:
         The pictures in the order of their names.
@@ -46,8 +46,6 @@ def read_srn(folder: str | Path, *, bounds: Sphere | None = None, root: Path | N
     Raises:
         DataError: anything wrong with a file.
     """
-    folder = Path(folder)
-    root = root or folder
     pictures = list_files(folder / "rgb", _SUFFIXES, root)
     if not pictures:
         raise DataError(folder / "rgb", "pictures", "none", "download the object again")
@@ -104,7 +102,7 @@ def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
     bounds = stated_bounds(manifest, folder / "manifest.json")
 
     def read(name: str) -> PosedTask:
-        return PosedTask.alternating(read_srn(paths[name], bounds=bounds, root=folder), name)
+        return PosedTask.alternating(read_srn(paths[name], folder, bounds), name)
 
     return Catalogue("srn", splits, read, manifest)
 

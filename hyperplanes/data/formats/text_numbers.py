@@ -18,7 +18,7 @@ LARGEST_TEXT = 2**20
 _REMEDY = "download it again"
 
 
-def read_rows(path: Path, expected: str, root: Path | None = None) -> list[list[float]]:
+def read_rows(path: Path, expected: str, root: Path) -> list[list[float]]:
     """The numbers of each line that is not empty.
 
     Args:
@@ -39,7 +39,7 @@ def read_rows(path: Path, expected: str, root: Path | None = None) -> list[list[
         return [[float(word) for word in line.split()] for line in lines if line.strip()]
 
 
-def read_numbers(path: Path, counts: Sequence[int], root: Path | None = None) -> npt.NDArray[np.float64]:
+def read_numbers(path: Path, counts: Sequence[int], root: Path) -> npt.NDArray[np.float64]:
     """All numbers of a file, as many as one of `counts` and finite; as `read_rows`."""
     expected = f"{' or '.join(map(str, counts))} finite numbers"
     values = np.array([value for row in read_rows(path, expected, root) for value in row], dtype=np.float64)

@@ -33,6 +33,7 @@ __all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "centred_matrix", "liste
 MEGAPIXEL = 2**20
 """Pixels above which photographs are scaled down unless the caller says by how much."""
 
+MOST_NAMES = 20  # in a message
 ENOUGH = 2 / 3  # of the frames of a file must be there
 ROUNDING = 1.01  # pixels by which a picture scaled to whole pixels may differ from the exact size
 
@@ -162,14 +163,14 @@ def assemble(listing: Listing, downscale: int | None = None, *, complete: bool =
     return replace(scene, up=listing.up, notes=(*scene.notes, *listing.notes)), kept
 
 
-def listed(names: Sequence[str], most: int = 20) -> str:
+def listed(names: Sequence[str]) -> str:
     """Names for a message: all of them, or the first ones and how many more there are.
 
-    >>> listed(["a", "b", "c"], 2)
-    'a, b and 1 more'
+    >>> listed(["a", "b"]), listed(["a"] * 22)[-15:]
+    ('a, b', 'a, a and 2 more')
     """
-    shown = ", ".join(names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+    shown = ", ".join(names[:MOST_NAMES])
+    return shown if len(names) <= MOST_NAMES else f"{shown} and {len(names) - MOST_NAMES} more"
 
 
 def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tuple[list[int], list[str]]:

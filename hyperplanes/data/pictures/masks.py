@@ -13,13 +13,13 @@ from hyperplanes.utilities.files import DataError, check_link
 __all__ = ["find_masks", "match_masks"]
 
 
-def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path | None = None) -> list[Path | None]:
+def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path) -> list[Path | None]:
     """The mask of each picture, found as `match_masks` does; white is what is kept.
 
     Args:
         folders: what may hold masks; the first one that exists counts.
         pictures: their files, some of which may be missing.
-        root: as in `files.check_regular`; the folder of the masks when None.
+        root: as in `files.check_regular`.
 
     Returns:
         A file a picture, None for a picture that is missing, and for all where there is no such folder.
@@ -52,7 +52,7 @@ def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None
     Args:
         folder: what holds masks.
         pictures: their files.
-        root: as in `find_masks`.
+        root: as in `find_masks`; the folder of the masks when None.
 
     Raises:
         DataError: no mask fits any picture, several of one name have folders that fit one equally well, or a link leads
