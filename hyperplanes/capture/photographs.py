@@ -80,9 +80,6 @@ def find_photographs(folder: Path) -> list[Path]:
 
     Numbers in names count as numbers, so that IMG_9 comes before IMG_10.
 
-    Args:
-        folder: what holds them.
-
     Raises:
         DataError: fewer than three, or HEIC photographs where nothing can read them.
     """
@@ -147,11 +144,7 @@ def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[
 
 
 def without_copies(photographs: Sequence[Photograph]) -> tuple[list[Photograph], list[str]]:
-    """The photographs without those whose file is byte for byte that of an earlier one, and a sentence about these.
-
-    Args:
-        photographs: in their order.
-    """
+    """The photographs without those whose file is byte for byte that of an earlier one, and a sentence about these."""
     sizes = Counter(one.path.stat().st_size for one in photographs)
     seen: set[bytes] = set()
     kept, copies = [], []
@@ -170,11 +163,9 @@ def without_copies(photographs: Sequence[Photograph]) -> tuple[list[Photograph],
 def read_upright(
     photograph: Photograph, max_size: int
 ) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
-    """The pixels of a photograph as it is stored in a capture: upright or on its side, scaled; and its mask.
+    """The pixels of a photograph as it is stored in a capture: upright or on its side; and its mask.
 
-    Args:
-        photograph: which one.
-        max_size: pixels along the longer side at most.
+    It is scaled down to `max_size` pixels along the longer side where it has more.
 
     Returns:
         The picture, which a mask does not change, and the opacity that the mask or, without one, alpha states; None

@@ -31,9 +31,6 @@ def guess_up(cameras: PinholeCamera) -> str | None:
     The horizontal axis of a level camera is perpendicular to it. An axis of the world goes first; else it is the
     direction that all horizontal axes are most nearly perpendicular to.
 
-    Args:
-        cameras: of one scene.
-
     Returns:
         One of UPS, or three numbers as `y_up_from` takes them; None where the cameras do not tell.
 
@@ -58,10 +55,6 @@ def guess_up(cameras: PinholeCamera) -> str | None:
 
 def stated_up(document: dict[str, Any], path: Path) -> str | None:
     """The "up" of a transforms.json, None where it does not say.
-
-    Args:
-        document: its content.
-        path: of the file, for the message.
 
     Returns:
         A direction as `y_up_from` takes it.

@@ -33,11 +33,7 @@ class PlainBackground:
 
 
 def is_plain(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bool:
-    """Whether most pictures have borders of one colour, each its own.
-
-    Args:
-        pictures: some of a capture.
-    """
+    """Whether most pictures have borders of one colour, each its own."""
     plain = 0
     for picture in pictures:
         lab = rgb2lab(picture[:: max(1, min(picture.shape[:2]) // 200), :: max(1, min(picture.shape[:2]) // 200)])

@@ -42,10 +42,6 @@ class Catalogue:
 def native(folder: Path, manifest: dict[str, Any]) -> Catalogue:
     """The catalogue of a native data set.
 
-    Args:
-        folder: what holds manifest.json.
-        manifest: its content.
-
     Returns:
         The catalogue.
 

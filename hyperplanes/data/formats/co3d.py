@@ -53,9 +53,6 @@ def read_sequence(folder: Path, root: Path) -> Listing:
 def catalogue(folder: Path) -> Catalogue | None:
     """The catalogue of a folder of categories, or of one; None where no annotations lie there.
 
-    Args:
-        folder: what may be in this layout.
-
     Returns:
         The sequences that have a folder: those of the frames to train on in set_lists_fewview_dev.json, those of the
         frames to test on and those to validate with, all to test on without such a list; views alternate between

@@ -71,9 +71,6 @@ def read_nmr(folder: Path, root: Path) -> Listing:
 def catalogue(folder: Path) -> Catalogue | None:
     """The catalogue of a folder of classes, or of one class; None where no list of objects lies there.
 
-    Args:
-        folder: what may be in this layout.
-
     Returns:
         The splits of the lists, views alternating between support and query. Objects whose folder is missing are
         skipped and counted.

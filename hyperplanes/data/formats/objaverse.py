@@ -60,10 +60,7 @@ def read_rendered(folder: Path, root: Path) -> Listing:
 
 
 def objaverse(folder: Path) -> Catalogue | None:
-    """The catalogue of a folder of such objects; None where it is something else.
-
-    Args:
-        folder: what may hold objects, and valid_paths.json.
+    """The catalogue of a folder of such objects, and perhaps valid_paths.json; None where it is something else.
 
     Returns:
         The objects, all of them to test on where no list says otherwise; views alternate between support and query.
@@ -116,9 +113,6 @@ def read_omniobject(folder: Path, downscale: int | None, root: Path) -> Posed:
 
 def omniobject(folder: Path) -> Catalogue | None:
     """The catalogue of blender_renders/, of what holds it, or of one category; None where it is something else.
-
-    Args:
-        folder: what may be in this layout.
 
     Returns:
         The objects, of each category the first three to test on; views alternate between support and query.

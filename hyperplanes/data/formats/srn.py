@@ -77,10 +77,6 @@ def read_srn(folder: Path, root: Path, bounds: Sphere | None = None) -> Posed:
 def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
     """The catalogue of a folder with CLASS_train, CLASS_val and CLASS_test, or of one of these, or of one object.
 
-    Args:
-        folder: what may be in SRN's layout.
-        manifest: of the folder, empty without one.
-
     Returns:
         The catalogue, views alternating between support and query; None when it is something else.
     """

@@ -19,9 +19,6 @@ _PACKED = frozenset({".zip", ".r3d"})  # Record3D's .r3d is a ZIP archive
 def refuse_unposed(path: Path) -> None:
     """Say what is missing where a path holds something that posed images can be made from.
 
-    Args:
-        path: a file or a folder in no layout that is read.
-
     Raises:
         DataError: photographs without poses, a video, or an archive.
     """

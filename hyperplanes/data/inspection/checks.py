@@ -17,11 +17,7 @@ PARALLEL = 1e-6  # from 1, the cosine of the angle between two axes: 0.08 degree
 
 
 def check_duplicates(views: Views) -> str | None:
-    """A sentence where one picture stands for several poses, None where each pose has a picture of its own.
-
-    Args:
-        views: of one scene.
-    """
+    """A sentence where one picture stands for several poses, None where each pose has a picture of its own."""
     names = views.names or tuple(map(str, range(len(views))))
     pose = camera.camera_from_world(views.cameras).reshape(len(views), -1)
     seen: dict[bytes, list[int]] = {}
@@ -40,9 +36,6 @@ def check_duplicates(views: Views) -> str | None:
 
 def check_gaze(views: Views) -> tuple[bool, str] | None:
     """Whether the cameras look at one place: the point nearest to all their axes is seen by most of them.
-
-    Args:
-        views: of one scene.
 
     Returns:
         Whether at least half of them see it, and a line that says how many; None where all axes are parallel, so that
@@ -67,10 +60,6 @@ def check_gaze(views: Views) -> tuple[bool, str] | None:
 @torch.no_grad()
 def check_splits(support: Views, query: Views) -> tuple[bool, str]:
     """Whether support and query are posed in one world.
-
-    Args:
-        support: one half of a scene.
-        query: the other half.
 
     Returns:
         False where they are clearly not, and a line that says what was compared.

@@ -105,9 +105,6 @@ class Conventions:
 def check_conventions(views: Views) -> Conventions:
     """Try the ways in which poses are commonly mistaken for others.
 
-    Args:
-        views: of one scene.
-
     Returns:
         The agreement under each reading of the poses: of the masks, or without masks of the pictures.
     """

@@ -22,10 +22,6 @@ def draw_coverage(report: SceneReport, views: Views) -> bytes:
 
     Above, a map of all directions seen from the object, azimuth across and elevation up, coloured by the angle to the
     nearest view; the views are dots, those with faults red. Below, the worst views, with what is said of each.
-
-    Args:
-        report: of the views.
-        views: the same.
     """
     figure: Any = new_figure(11, 7.5)
     above, below = figure.subfigures(2, 1, height_ratios=(1.3, 1))

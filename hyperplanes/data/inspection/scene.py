@@ -223,12 +223,7 @@ def stand_upright(views: Views) -> Views:
 
 
 def angles_to(axes: Float[Tensor, "view 3"], directions: Float[Tensor, "direction 3"]) -> Float[Tensor, " direction"]:
-    """Degrees from each direction to the nearest view.
-
-    Args:
-        axes: unit vectors to the views.
-        directions: unit vectors.
-    """
+    """Degrees from each direction to the nearest view, all unit vectors."""
     return torch.rad2deg(torch.acos((directions @ axes.T).amax(1).clamp(-1, 1)))
 
 

@@ -116,13 +116,7 @@ def small_masks(
 def silhouettes(
     points: Float[Tensor, "voxel 3"], hull: Occupancy, cameras: PinholeCamera
 ) -> Bool[Tensor, "view height width"]:
-    """Which pixels see a voxel: its centre's pixel, those around it as far as half the voxel reaches, and gaps of two.
-
-    Args:
-        points: centres of the voxels.
-        hull: their grid.
-        cameras: one a silhouette.
-    """
+    """Which pixels see a voxel: its centre's, those around it as far as half the voxel reaches, and gaps of two."""
     height, width = camera.image_size(cameras)
     matrices = camera.projection_matrices(cameras)
     seen = torch.zeros(len(matrices), height, width, dtype=torch.bool)

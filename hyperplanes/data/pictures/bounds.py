@@ -90,9 +90,6 @@ def cut_off(masks: Float[Tensor, "view 1 height width"]) -> Bool[Tensor, " view"
 
     A single pixel that is hardly opaque counts: a view that is taken to show the object whole bounds it. For the
     weights of colours, where a few pixels do no harm, `geometry.visibility.margins` asks for more.
-
-    Args:
-        masks: opacity.
     """
     opaque = masks[:, 0] > 0
     sides = [opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]]
@@ -103,9 +100,6 @@ def are_inverted(masks: Float[Tensor, "view 1 height width"] | UInt8[Tensor, "vi
     """Whether masks seem to show the background: most cover their picture's border, and what they leave is within it.
 
     An object that fills its pictures reaches their borders, too, and leaves less within them.
-
-    Args:
-        masks: opacity in [0, 1] or of 8 bits.
     """
     if not len(masks):
         return False
@@ -140,10 +134,6 @@ def are_shown(
 
 def stated_bounds(document: dict[str, Any], path: Path) -> Sphere | None:
     """The "scene_sphere" of a transforms.json or a manifest, or None where there is none.
-
-    Args:
-        document: its content.
-        path: of the file, for the message.
 
     Returns:
         The sphere in the world of the poses.

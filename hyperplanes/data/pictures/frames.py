@@ -268,11 +268,7 @@ def scaled_matrix(
 
 
 def centred_matrix(focal: float, size: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """The calibration, integer pixel centres, of a picture of (height, width) whose principal point is its middle.
-
-    Args:
-        focal: focal length in widths of the picture.
-        size: of the picture.
+    """The calibration, integer pixel centres, of a picture of (height, width) around its middle; `focal` is in widths.
 
     >>> centred_matrix(0.5, (2, 4)).tolist()
     [[2.0, 0.0, 1.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]
