@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,11 +32,10 @@ _REMEDY = "export the cameras again"
 
 @dataclass(frozen=True)
 class _Sensor:
-    """Size, focal lengths, principal point (from the corner) and lens of the pictures of one camera body."""
+    """Size, calibration and lens of the pictures of one camera body."""
 
     size: tuple[int, int]
-    focal: tuple[float, float]
-    centre: tuple[float, float]
+    calibrate: Callable[[tuple[int, int]], npt.NDArray[np.float64]]
     lens: tuple[float, ...]
 
 
@@ -91,9 +91,8 @@ def read_metashape(folder: Path, root: Path) -> Listing:
     for camera, pose, picture, mask in zip(kept, poses, pictures, masks, strict=True):
         sensor = sensors[camera.get("sensor_id", "")]
         assert sensor is not None
-        calibrate = calibrated(sensor.focal, sensor.centre, sensor.size, path)
         written = picture.relative_to(folder).as_posix()
-        frames.append(Frame(picture, written, pose, calibrate, sensor.size, sensor.lens, mask))
+        frames.append(Frame(picture, written, pose, sensor.calibrate, sensor.size, sensor.lens, mask))
     left_out = [each.get("label", "") for each in cameras if each not in kept]
     why = "not aligned, not enabled, without calibration or in another component"
     notes = (f"{len(left_out)} of {len(cameras)} cameras are {why}: {listed(left_out)}",) if left_out else ()
@@ -141,7 +140,7 @@ def _sensor(element: Element, path: Path) -> _Sensor | None:
         raise DataError(where, "the focal length f", ", ".join(value) or "nothing", _REMEDY)
     focal = value["f"] + value.get("b1", 0.0), value["f"]
     centre = width / 2 + value.get("cx", 0.0), height / 2 + value.get("cy", 0.0)
-    calibrated(focal, centre, (height, width), where)
+    calibrate = calibrated(focal, centre, (height, width), where)
     moved = abs(value.get("b2", 0.0)) * height / 2 / value["f"]
     if moved > _SKEW or value.get("p3", 0.0) or value.get("p4", 0.0):
         found_text = "p3 or p4" if moved <= _SKEW else f"a skew b2 that moves pixels by {moved:.2g}"
@@ -150,12 +149,8 @@ def _sensor(element: Element, path: Path) -> _Sensor | None:
         )
     radial = [value.get(f"k{index}", 0.0) for index in range(1, 5)]
     reach = math.hypot(width, height) / 2 / min(focal)
-    return _Sensor((height, width), focal, centre, brown_lens(radial, _tangential(value), reach, where))
-
-
-def _tangential(value: dict[str, float]) -> tuple[float, float]:
-    """OpenCV's p1 and p2: Metashape's, the other way round."""
-    return value.get("p2", 0.0), value.get("p1", 0.0)
+    tangential = value.get("p2", 0.0), value.get("p1", 0.0)  # OpenCV's p1 and p2: Metashape's, the other way round
+    return _Sensor((height, width), calibrate, brown_lens(radial, tangential, reach, where))
 
 
 def _similarity(element: Element, path: Path) -> _Similarity:

@@ -61,14 +61,11 @@ def read_polycam(folder: Path, root: Path) -> Listing:
             size = int(stated["height"]), int(stated["width"])
             calibrate = calibrated(focal, centre, size, path)
         camera_from_world = opencv_from_opengl(check_pose(pose, path, path.stem)[None])[0]
-        picture = next((each for each in _named(pictures, path.stem) if each.is_file()), pictures / f"{path.stem}.jpg")
+        named = [pictures / f"{path.stem}{ending}" for ending in (".jpg", ".jpeg", ".png")]
+        picture = next((each for each in named if each.is_file()), named[0])
         check_link(picture, root)
         frames.append(Frame(picture, picture.relative_to(folder).as_posix(), camera_from_world, calibrate, size))
     homes = [cameras.parent / "masks", folder / "masks"]
     masks = find_masks(homes, [frame.path for frame in frames], root)
     frames = [replace(frame, mask=mask) for frame, mask in zip(frames, masks, strict=True)]
     return Listing(frames, cameras, up="y")
-
-
-def _named(pictures: Path, stem: str) -> list[Path]:
-    return [pictures / f"{stem}{ending}" for ending in (".jpg", ".jpeg", ".png")]
