@@ -11,6 +11,7 @@ import numpy.typing as npt
 from hyperplanes.data.formats.catalogue import Catalogue
 from hyperplanes.data.formats.text_numbers import read_numbers, read_rows
 from hyperplanes.data.pictures.bounds import stated_bounds
+from hyperplanes.data.pictures.frames import scaled_matrix
 from hyperplanes.data.pictures.images import image_size, read_image
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
@@ -123,11 +124,5 @@ def _intrinsics(path: Path, size: tuple[int, int], root: Path) -> npt.NDArray[np
         height, width = (lines[4] if len(lines) > 4 else lines[-1])[:2]
     if not np.isfinite([focal, centre_x, centre_y, height, width]).all() or min(focal, height, width) <= 0:
         raise DataError(path, "finite and positive numbers", f"{lines}", "download it again")
-    scale = np.array([size[1] / width, size[0] / height])
-    return np.array(
-        [
-            [focal * scale[0], 0.0, centre_x * scale[0] - 0.5],
-            [0.0, focal * scale[1], centre_y * scale[1] - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    matrix = np.array([[focal, 0.0, centre_x - 0.5], [0.0, focal, centre_y - 0.5], [0.0, 0.0, 1.0]])
+    return scaled_matrix(matrix, (height, width), size)
