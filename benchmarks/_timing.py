@@ -52,7 +52,6 @@ def interleaved(
 
     Args:
         ways: by name; each is run once before, unmeasured.
-        repeats: rounds.
         seconds: no further round is begun after this time.
         row: runs in a row that make one turn, whose mean counts; what is called again and again in real work finds its
             memory and its caches warm, which a single run after another way does not.
@@ -77,12 +76,7 @@ def interleaved(
 
 
 def add_device_option(parser: argparse.ArgumentParser, default: str) -> None:
-    """Adds --device, a name of PyTorch; one that is not here ends the program with a line.
-
-    Args:
-        parser: of a benchmark.
-        default: where the option is absent.
-    """
+    """Adds --device, a name of PyTorch; one that is not here ends the program with a line."""
 
     def known(name: str) -> str:
         try:
@@ -108,12 +102,7 @@ def ratio(reference: list[float], ours: list[float]) -> dict[str, float]:
 
 
 def peak_bytes(run: Callable[[], object], device: str = "cpu") -> int:
-    """The most memory that PyTorch and NumPy held for one run, beyond what was there before, results included.
-
-    Args:
-        run: what is called.
-        device: whose memory counts.
-    """
+    """The most memory that PyTorch and NumPy held for one run, beyond what was there before, results included."""
     if device != "cpu":
         torch.cuda.reset_peak_memory_stats()
         held = torch.cuda.memory_allocated()

@@ -36,11 +36,7 @@ TUNING = "fine-tuned"
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks adapting", description=__doc__)
     parser.add_argument("--views", type=Path, help="posed images; a procedural car when not given")
     parser.add_argument("--checkpoint", default="small", help="the model (default: %(default)s)")

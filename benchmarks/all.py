@@ -85,11 +85,7 @@ PLOTTED = {"lookup": "lookup.png", "rendering": "rendering.png", "training_curve
 
 
 def main(arguments: list[str]) -> int:
-    """Run all, and say which failed.
-
-    Args:
-        arguments: see --help.
-    """
+    """Run all, and say which failed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks all", description=__doc__)
     parser.add_argument("--out", type=Path, default=RESULTS, help="the folder of the results (default: %(default)s)")
     parser.add_argument("--data", type=Path, nargs="+", default=[],
@@ -122,7 +118,6 @@ def _run(commands: dict[str, list[str]], workers: int, settings: dict[str, str])
 
     Args:
         commands: by the names of their results.
-        workers: how many run at once.
         settings: of their environment, where it does not say otherwise.
     """
 

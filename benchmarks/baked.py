@@ -32,11 +32,7 @@ __all__ = ["main"]
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks baked", description=__doc__)
     add_data_options(parser)
     parser.add_argument("--counts", type=positive, nargs="+", default=[25], help="numbers of support views")

@@ -40,11 +40,7 @@ WARM, SHORTEST = 0.5, 1.0  # seconds of work before the first repetition, and of
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks busy", description=__doc__)
     parser.add_argument("--works", nargs="+", choices=WORKS, default=list(WORKS))
     parser.add_argument("--policies", nargs="+", choices=("passive", "active"), default=["passive"])

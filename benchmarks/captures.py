@@ -109,11 +109,7 @@ def compare_poses(found: Float[np.ndarray, "camera 4 4"], true: Float[np.ndarray
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks captures", description=__doc__)
     parser.add_argument("--meshes", type=Path, nargs="+", help="meshes, and folders of them; ellipsoids if not given")
     parser.add_argument("--count", type=positive, default=3, help="objects of each folder, or ellipsoids")
@@ -296,9 +292,7 @@ def _quality(
     """PSNR in dB of the views that were not shown, against the photographs over white by their true masks.
 
     Args:
-        scene: what is read.
         method: what adapts to half of it.
-        truth: the photographs.
         prepare: what is done with the support views before.
 
     Returns:
@@ -346,7 +340,6 @@ def damaged_masks(masks: Sequence[np.ndarray], seed: int) -> list[np.ndarray]:
 
     Args:
         masks: opacity in [0, 1].
-        seed: of which, and where.
     """
     generator = np.random.default_rng(seed)
     result = [ndimage.gaussian_filter(mask.astype(float), SOFT * max(mask.shape)) for mask in masks]

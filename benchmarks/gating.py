@@ -31,11 +31,7 @@ QUERY = 2
 
 
 def main(arguments: list[str]) -> int:
-    """Train, and write the model.
-
-    Args:
-        arguments: see --help.
-    """
+    """Train, and write the model."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks gating", description=__doc__)
     add_data_options(parser)
     parser.add_argument("--objects", type=positive, default=24, help="held-out ones of each data set")

@@ -56,11 +56,7 @@ class Run:
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print the rows, and write them as JSON where asked.
-
-    Args:
-        arguments: --quick for a rough answer in about a minute, --full to make the thousand objects, --json FILE.
-    """
+    """Measure, print the rows, and write them as JSON where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks generation", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer objects and rounds")
     parser.add_argument("--full", action="store_true", help="make 1,000 objects x 50 views instead of extrapolating")
@@ -83,8 +79,6 @@ def compare(renderer: str, folder: Path, *, rounds: int, objects: int) -> list[R
 
     Args:
         renderer: a name in `data_gen.rendering.renderers.RENDERERS`.
-        folder: where they write.
-        rounds: how often each runs.
         objects: how many ours makes a round; the loop makes a sixth.
 
     Returns:
@@ -142,8 +136,6 @@ def generated(objects: int, out: Path, supersample: int = SUPERSAMPLE) -> Run:
     """What `data_gen.datasets.generate.generate` takes for cars, with a worker a core.
 
     Args:
-        objects: how many.
-        out: where to.
         supersample: samples along a side of a pixel.
     """
     from data_gen.datasets.generate import GenerationConfig, Procedural, generate
@@ -165,8 +157,6 @@ def looped(objects: int, out: Path, renderer: str) -> Run:
     """What the obvious loop takes, in a process of its own.
 
     Args:
-        objects: how many cars.
-        out: where to.
         renderer: that draws, one of pyrender's.
     """
     told: dict[str, float] = {}
@@ -180,13 +170,7 @@ def looped(objects: int, out: Path, renderer: str) -> Run:
 
 
 def stages(renderer: str, objects: int, folder: Path) -> list[Row]:
-    """Processor time by stage, of one worker without threads.
-
-    Args:
-        renderer: that draws.
-        objects: how many.
-        folder: where to.
-    """
+    """Processor time by stage, of one worker without threads."""
     spent = _part("stages", objects, folder / "stages", LP_NUM_THREADS="0", OMP_NUM_THREADS="1")
     start = spent.pop("start")
     total = sum(spent.values()) - spent["one sample a pixel drawn"]
@@ -220,7 +204,6 @@ def memory(objects: int, folder: Path) -> Row:
 
     Args:
         objects: how many, with 2 views of 32x32 each.
-        folder: where they are written.
 
     Returns:
         Medians of the resident memory in MB over the second and the last tenth of the objects, and the growth.

@@ -20,10 +20,6 @@ VIEWS, RESOLUTION = 50, 128
 def obvious_loop(objects: int, out: Path) -> dict[str, float]:
     """What one would write first with pyrender: a new renderer for every mesh, whose pictures it draws and writes.
 
-    Args:
-        objects: how many cars.
-        out: where the pictures go.
-
     Returns:
         The number of images, the seconds until the first object was done, imports included, and those of each further.
     """
@@ -69,7 +65,6 @@ def stages(objects: int, out: Path) -> dict[str, float]:
 
     Args:
         objects: how many cars; one more is drawn before, unmeasured.
-        out: where the files go.
 
     Returns:
         Milliseconds by stage; and the seconds of processor time that the process took to start.

@@ -58,11 +58,7 @@ SPAN = 1 << 14  # points by which graphs and compiled functions differ in size
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks gpu", description=__doc__)
     parser.add_argument("--data", type=Path, help="a data set; a procedural car where absent")
     add_device_option(parser, "cuda")

@@ -59,11 +59,7 @@ TRAINING: dict[str, dict[str, Any]] = {"no_warmup": {"warmup": 0}, "paper_rates"
 
 
 def main(arguments: list[str]) -> int:
-    """Train, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Train, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks hypernetwork", description=__doc__)
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets, a class each")
     parser.add_argument("--variant", nargs="+", choices=VARIANTS, default=["none", "low_rank"])
@@ -99,9 +95,7 @@ def variant(name: str, *, planes: int = 25, optimiser: str = "muon", tasks: int 
     Args:
         name: one of VARIANTS.
         planes: of the field; the hypernetwork reads as many views, at most 5.
-        optimiser: of theta.
         tasks: objects a step.
-        steps: of training.
     """
     made, changes = preset("quick"), VARIANTS[name][1]
     trained = {"optimiser": optimiser, **TRAINING.get(name, {})}
@@ -119,9 +113,7 @@ def measure(made: Preset, data: Tasks, folder: Path | None = None, views: int = 
     """Train and judge on the held-out objects.
 
     Args:
-        made: model and training.
         data: tasks; names begin with the name of their class where there are several.
-        folder: for checkpoints.
         views: query views of each object that are compared.
 
     Returns:

@@ -213,11 +213,7 @@ VARIANTS: dict[str, type[ImageBasedNeRF]] = {
 
 
 def main(arguments: list[str]) -> int:
-    """Train, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Train, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks image_based", description=__doc__)
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets")
     parser.add_argument("--variant", nargs="+", choices=(*VARIANTS, *HYPERNETWORKS, "white"), default=list(VARIANTS))
@@ -259,8 +255,6 @@ def configured(name: str, steps: int, seed: int) -> Preset:
 
     Args:
         name: of VARIANTS, "white" or HYPERNETWORKS; only the last have a hypernetwork.
-        steps: of training.
-        seed: of weights and training.
     """
     TARGETS[name] = VARIANTS.get(name, ImageBasedNeRF)
     made, wanted = preset("small"), HYPERNETWORKS.get(name)
@@ -288,12 +282,7 @@ def configured(name: str, steps: int, seed: int) -> Preset:
 
 
 def trained(made: Preset, data: Any) -> HyperPlanes:
-    """A model after its training.
-
-    Args:
-        made: model and training.
-        data: the objects.
-    """
+    """A model after its training."""
     model = HyperPlanes(made.model, made.training.seed)
     trainer = Trainer(model, data, made.training)
     while trainer.step < made.training.steps:

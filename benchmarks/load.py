@@ -38,11 +38,7 @@ def load_at_start() -> float:
 
 
 def measure_load(seconds: float = 1.0) -> float:
-    """Cores that are busy while this process sleeps; the load average of a minute where Linux does not tell.
-
-    Args:
-        seconds: how long to watch.
-    """
+    """Cores that are busy while this process sleeps; the load average of a minute where Linux does not tell."""
     if not STATISTICS.exists():
         return os.getloadavg()[0]
     before, begun = _busy_ticks(), time.perf_counter()

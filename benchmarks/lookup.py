@@ -41,10 +41,8 @@ def measure(scene: Scene, part: str, gradient: bool, repeats: int, bandwidth: fl
     """A row for every way of doing one part, all in interleaved repetitions.
 
     Args:
-        scene: what is looked at.
         part: "projection", "sampling" or "both".
         gradient: with the pull-back to points and images.
-        repeats: rounds.
         bandwidth: of a copy on this machine, in bytes a second; without it, memory is not looked at.
     """
     calls = runs(*ways(scene, part), gradient)
@@ -88,11 +86,7 @@ def sweep(repeats: int, quick: bool, device: str) -> list[Row]:
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print the table, and write JSON and a plot where asked.
-
-    Args:
-        arguments: --quick for a rough answer within a minute, --json FILE, --plot FILE, --threads N.
-    """
+    """Measure, print the table, and write JSON and a plot where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks lookup", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer repetitions and settings, within a minute")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")

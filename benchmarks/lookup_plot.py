@@ -28,8 +28,6 @@ def plot(rows: list[Row], path: Path, title: str) -> None:
     """The standard setting as bars, the sweeps as lines, in one picture.
 
     Args:
-        rows: of the benchmark.
-        path: of the picture.
         title: the machine, in words.
     """
     from matplotlib.figure import Figure

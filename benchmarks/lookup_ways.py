@@ -62,7 +62,6 @@ def ways(scene: Scene, part: str) -> tuple[Leaves, dict[str, Way]]:
     """The inputs of one part of the work, and everything that can do it.
 
     Args:
-        scene: what is looked at.
         part: "projection", "sampling" or "both".
 
     Returns:
@@ -164,8 +163,6 @@ def needed_bytes(scene: Scene, part: str, gradient: bool, way: str) -> int:
     """What must be read and written at least once: points, planes, results; with a gradient theirs too.
 
     Args:
-        scene: what is looked at.
-        part: of the work.
         gradient: whether the pull-back is included.
         way: packed pictures are a third of the size.
     """

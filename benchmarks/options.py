@@ -10,9 +10,6 @@ __all__ = ["positive"]
 def positive(text: str) -> int:
     """A whole number above 0, as the `type` of an option.
 
-    Args:
-        text: as it was given.
-
     Raises:
         ArgumentTypeError: another number, or none.
     """

@@ -46,11 +46,7 @@ VIEWS = {64: 3, 128: 3, 200: 2, 400: 1}  # how many of so many pixels a side
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks rendering", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="64 pixels alone, about a minute")
     parser.add_argument(

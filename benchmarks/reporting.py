@@ -18,10 +18,7 @@ def finish(name: str, rows: list[Row], json_file: Path | None, device: str = "cp
     """Print the rows, one a line, and write them with their environment where asked.
 
     Args:
-        name: of the benchmark.
         rows: what was measured; each has a "name".
-        json_file: where to, or None.
-        device: what was measured.
 
     Returns:
         The exit code, 0.
@@ -35,13 +32,6 @@ def finish(name: str, rows: list[Row], json_file: Path | None, device: str = "cp
 
 
 def write_rows(name: str, rows: list[Row], json_file: Path, device: str = "cpu") -> None:
-    """Write rows with the commit and the hardware.
-
-    Args:
-        name: of the benchmark.
-        rows: what was measured.
-        json_file: where to.
-        device: what was measured.
-    """
+    """Write rows with the commit and the hardware."""
     content = {"benchmark": name, "device": device, **environment(), "load": round(load_at_start(), 2), "rows": rows}
     write_whole(json_file, (json.dumps(content, indent=2) + "\n").encode())

@@ -42,11 +42,7 @@ __all__ = ["main"]
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks small", description=__doc__)
     parser.add_argument("--sizes", type=positive, nargs="+", default=[128, 400], help="pixels a side of the car")
     parser.add_argument("--scene", type=Path, help="a posed scene in place of the car")

@@ -33,11 +33,7 @@ COMPARED = 8  # views
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks splats", description=__doc__)
     parser.add_argument("--objects", nargs="+", default=["car", "chair"], help="classes (default: car chair)")
     parser.add_argument("--sizes", type=positive, nargs="+", default=[100], help="pixels a side (default: 100)")

@@ -40,11 +40,7 @@ RATE = 1e-6  # so small that the weights stay what they are, and the work with t
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks steps", description=__doc__)
     parser.add_argument("--data", type=Path, help="a data set; procedural cars where absent")
     parser.add_argument("--untrained", action="store_true", help="begin with first weights, not the packaged ones")

@@ -28,11 +28,7 @@ MARKED = re.compile(r"(<!-- benchmarks (\w+) -->\n).*?(<!-- end -->)", re.DOTALL
 
 
 def main(arguments: list[str]) -> int:
-    """Fill the tables of all pages.
-
-    Args:
-        arguments: --results FOLDER.
-    """
+    """Fill the tables of all pages."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks tables", description=__doc__)
     parser.add_argument("--results", type=Path, default=RESULTS, help="where the rows are (default: %(default)s)")
     chosen = parser.parse_args(arguments)
@@ -48,7 +44,6 @@ def fill(text: str, results: Path = RESULTS, page: Path | str = "page") -> str:
     """A page with its tables as the results have them.
 
     Args:
-        text: the page.
         results: the folder of the results, NAME.json.
         page: its name, for messages.
 

@@ -49,11 +49,7 @@ class Objects:
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: --quick, --curves STEPS, --json FILE, --plot FILE, --device NAME.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks training", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="the quick preset alone, few steps")
     parser.add_argument("--curves", type=int, metavar="STEPS", help="train both this far instead, which takes long")

@@ -68,11 +68,7 @@ QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_second
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks views", description=__doc__)
     add_data_options(parser)
     parser.add_argument("--counts", type=positive, nargs="+", help="numbers of support views: 1 3 5 10 25")
@@ -166,8 +162,6 @@ def _measured(
 
     Args:
         by_seed: the methods by the names of their rows, for every seed.
-        shown: the tasks.
-        names: the objects.
         made: takes the query views and what one forward pass makes of them.
 
     Yields:

@@ -29,11 +29,7 @@ BEST, NEAREST = 8, 4
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked.
-
-    Args:
-        arguments: see --help.
-    """
+    """Measure, print, and write the rows where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks visibility", description=__doc__)
     parser.add_argument("--points", type=positive, default=20_000)
     parser.add_argument("--size", type=positive, default=128, help="pixels a side")
