@@ -7,7 +7,7 @@ which one is shaded; ours shades each of four, or of nine, the default.
 
 Speed is told by the clock, and by processor time, which counts all that the processes computed on any core and is less
 disturbed by others on the machine; `load` is how many processes wanted a core, ours included. A thousand objects are
-extrapolated, from the time until the first is done and that of each further one, unless --full makes them.
+extrapolated, from the time until the first is done and that of each further one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks._timing import ratio
-from benchmarks.generation_parts import RESOLUTION, VIEWS
+from benchmarks.generation_loop import RESOLUTION, VIEWS
 from benchmarks.reporting import Row, finish
 from data_gen import SUPERSAMPLE
 from hyperplanes.utilities.environment import usable_cores
@@ -59,7 +59,6 @@ def main(arguments: list[str]) -> int:
     """Measure, print the rows, and write them as JSON where asked."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks generation", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer objects and rounds")
-    parser.add_argument("--full", action="store_true", help="make 1,000 objects x 50 views instead of extrapolating")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
     options = parser.parse_args(arguments)
     from data_gen.rendering.renderers import find_renderer
@@ -67,9 +66,6 @@ def main(arguments: list[str]) -> int:
     renderer = find_renderer().name
     with tempfile.TemporaryDirectory() as folder:
         rows = compare(renderer, Path(folder), rounds=2 if options.quick else 5, objects=24 if options.quick else 60)
-        rows += stages(renderer, 4 if options.quick else 10, Path(folder))
-        if options.full:
-            rows.append(thousand(Path(folder)))
         rows.append(memory(60 if options.quick else THOUSAND, Path(folder)))
     return finish("generation", rows, options.json)
 
@@ -162,41 +158,15 @@ def looped(objects: int, out: Path, renderer: str) -> Run:
     told: dict[str, float] = {}
 
     def run() -> int:
-        told.update(_part("loop", objects, out, PYOPENGL_PLATFORM=renderer.removeprefix("pyrender-")))
+        out.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, "-m", "benchmarks.generation_loop", str(objects), str(out)]
+        platform = {"PYOPENGL_PLATFORM": renderer.removeprefix("pyrender-")}
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=os.environ | platform)
+        told.update(json.loads(done.stdout.splitlines()[-1]))
         return int(told["images"])
 
     whole = measured(run)
     return replace(whole, first=told["first"], each=told["each"])
-
-
-def stages(renderer: str, objects: int, folder: Path) -> list[Row]:
-    """Processor time by stage, of one worker without threads."""
-    spent = _part("stages", objects, folder / "stages", LP_NUM_THREADS="0", OMP_NUM_THREADS="1")
-    start = spent.pop("start")
-    total = sum(spent.values()) - spent["one sample a pixel drawn"]
-    rows: list[Row] = [
-        {"name": f"stage: {stage}", "renderer": renderer, "milliseconds_an_image": value, "share": value / total}
-        for stage, value in spent.items()
-    ]
-    return [*rows, {"name": "stage: start of a worker and its first object", "seconds": start}]
-
-
-def _part(name: str, objects: int, out: Path, **environment: str) -> dict[str, float]:
-    """What a part of `benchmarks.generation_parts` prints."""
-    out.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "benchmarks.generation_parts", name, str(objects), str(out)]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=os.environ | environment)
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def thousand(folder: Path) -> Row:
-    """The time that 1,000 objects of 50 views take."""
-    run = generated(THOUSAND, folder / "thousand")
-    return {
-        "name": "1,000 objects x 50 views at 128x128, made",
-        "seconds": run.wall,
-        "processor_seconds": run.processor,
-    }
 
 
 def memory(objects: int, folder: Path) -> Row:
