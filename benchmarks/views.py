@@ -6,12 +6,12 @@
 
 Of every held-out object some query views are kept back to be judged by; of all others, support and query alike, so many
 are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
-(where there are masks), of views alone and with their reflections; the same field from random weights; the model
-without its hypernetwork, with the update of another object of the data set, with its own alone, averaged with the
-visual hull by one share an object, without reflections of views, without a canonical frame, with one ray a pixel, in
-single precision, with residual correction (of steps, too), and as it is used; and fine-tuned. Beside each mean stands
-how far it lies above `hull_blend`, steps above as many from random weights, and what is corrected above what is not,
-with the 95 % interval of that difference over the objects (paired, Student's t).
+(where there are masks), of views alone and with their reflections; the model without its hypernetwork, with the update
+of another object of the data set, with its own alone, averaged with the visual hull by one share an object, without
+reflections of views, without a canonical frame, with one ray a pixel, in single precision, with residual correction (of
+steps, too), and as it is used; and fine-tuned. Beside each mean stands how far it lies above `hull_blend`, steps above
+as many from random weights, and what is corrected above what is not, with the 95 % interval of that difference over the
+objects (paired, Student's t).
 
 With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
 Image are compared, has 251 views on a spiral, of which view 64, or views 64 and 128, are shown.
@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -53,15 +53,13 @@ from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
-from hyperplanes.geometry.volume import CHANNELS
-from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Task, Tasks, Views
 
-__all__ = ["METHODS", "PARTS", "adapters", "add_data_options", "main", "suite_folders"]
+__all__ = ["METHODS", "adapters", "add_data_options", "main", "suite_folders"]
 
 QUERY = 3  # views of each object that it is judged by, where the options do not say
 QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_seconds")
@@ -83,7 +81,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--methods",
         nargs="*",
-        choices=(*METHODS, *PARTS),
+        choices=METHODS,
         default=["nearest_view", "hull_blend", "swapped"],
         help="beside the model itself",
     )
@@ -169,7 +167,7 @@ def _measured(
     """
     scores: dict[str, Score] = {}
     for method in sorted(by_seed[0], key=_after_its_references):
-        without_steps = method == "one_step" or method in METHODS | PARTS
+        without_steps = method == "one_step" or method in METHODS
         tried = [each[method] for each in (by_seed[:1] if without_steps else by_seed)]
         keep = partial(_keep, made) if method == "one_step" else None
         score = merge_seeds([evaluate(method, each, shown, names, keep) for each in tried])
@@ -292,7 +290,7 @@ def adapters(
     for name in wanted:
         needs_others = name == "swapped" and (model.hypernetwork is None or len(names) < 2)
         if not (needs_others or (name.startswith("hull_blend") and shown.task(names[0]).support.masks is None)):
-            found[name] = (METHODS | PARTS)[name](model, shown, names)
+            found[name] = METHODS[name](model, shown, names)
     found["one_step"] = model
     for each in steps:
         settings = FineTuning(seed=seed)
@@ -310,31 +308,25 @@ def adapters(
 
 
 @dataclass(frozen=True)
-class _Partly:
-    """A model with a part of its update, or whose hypernetwork reads a part of the volume; not trained to be used so.
+class _FieldAlone:
+    """A model whose pictures are its field's alone, without the visual hull's.
 
     Attributes:
         model: the model.
-        updated: which parameters are updated, by name.
-        masked: channels of the volume that are set to zero.
+        updated: by the hypernetwork; else the field is that of theta.
     """
 
     model: HyperPlanes
-    updated: Callable[[str], bool] = lambda name: True
-    masked: tuple[int, ...] = ()
+    updated: bool
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The field of theta and what is left of the update."""
+        """The field."""
         model = self.model.eval()
         placed = to_canonical_frame(model, support)
         prepared = placed.context(model)
-        if prepared.volume is not None:
-            kept = [float(channel not in self.masked) for channel in range(CHANNELS)]
-            volume = prepared.volume * prepared.volume.new_tensor(kept)[:, None, None, None]
-            prepared = replace(prepared, volume=volume)
-        update = Parameters((name, value) for name, value in model.update(prepared).items() if self.updated(name))
-        return placed.in_scene(model.rendering_field(prepared, model.theta + update))
+        parameters = model.theta + model.update(prepared) if self.updated else model.theta
+        return placed.in_scene(model.rendering_field(prepared, parameters))
 
 
 @dataclass(frozen=True)
@@ -411,10 +403,9 @@ METHODS = {
     "nearest_view": lambda *_: NearestView(),
     "hull_blend": lambda *_: HullBlend(),
     "hull_blend_reflected": lambda *_: ReflectedHullBlend(),
-    "random_weights": lambda model, *_: FromScratch(model, 0),
-    "theta": lambda model, *_: _Partly(model, lambda name: False),
+    "theta": lambda model, *_: _FieldAlone(model, updated=False),
     "swapped": _swapped,
-    "unstacked": lambda model, *_: _Partly(model),
+    "unstacked": lambda model, *_: _FieldAlone(model, updated=True),
     "ungated": lambda model, *_: _Ungated(model),
     "unreflected": lambda model, *_: _Unreflected(model),
     "unrotated": lambda model, *_: _Unrotated(model),
@@ -422,10 +413,3 @@ METHODS = {
     "residuals": lambda model, *_: WithResiduals(model),
     "single_precision": lambda model, *_: _Rendered(model, {"mixed_precision": False}),
 }
-
-PARTS = {
-    "without_share": lambda model, *_: _Partly(model, masked=(0,)),
-    "without_colours": lambda model, *_: _Partly(model, masked=(1, 2, 3)),
-    "without_number": lambda model, *_: _Partly(model, masked=(4,)),
-}
-"""Parts of what a hypernetwork that reads a volume reads, left out at use."""
