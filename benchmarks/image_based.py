@@ -13,13 +13,11 @@ import argparse
 import dataclasses
 import time
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from torch import Tensor, nn
-from torch.nn.functional import conv2d, relu
+from torch import Tensor
 
 from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
@@ -29,9 +27,8 @@ from hyperplanes.data.dataset import Dataset, open_dataset, open_datasets
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TARGETS, ImageBasedConfig, ImageBasedNeRF
-from hyperplanes.fields.image_based import READ, ImageBasedField
-from hyperplanes.geometry import ImagePlanes
-from hyperplanes.geometry.chosen_views import ChosenViews, Visibility
+from hyperplanes.fields.image_based import ImageBasedField
+from hyperplanes.geometry.chosen_views import Visibility
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.training import Trainer
@@ -81,8 +78,8 @@ class _WithoutOrder(ImageBasedNeRF):
 class _PlainField(ImageBasedField):
     """The colour is the network's alone."""
 
-    def blended(self, weights: Tensor, colours: Tensor) -> Tensor:
-        return torch.full_like(colours[:, 0], 0.5)
+    def _blend(self, value: Tensor, weights: Tensor, colours: Tensor) -> Tensor:
+        return super()._blend(value, weights, torch.full_like(colours, 0.5))
 
 
 class _WithoutBlending(ImageBasedNeRF):
@@ -98,89 +95,6 @@ class _RandomStart(ImageBasedNeRF):
         super().__init__(*given)
         torch.nn.init.kaiming_uniform_(self.density.weight, nonlinearity="relu")
         torch.nn.init.constant_(self.density.bias, -2.0)
-
-
-POOLED = 32  # features of a view that are pooled
-
-
-@dataclass(frozen=True)
-class _PooledField(ImageBasedField):
-    """The views of a point in no order: weighted mean and variance of learned features, as in IBRNet."""
-
-    def joined(self, slots: Tensor) -> Tensor:
-        features = relu(self.layer("of_view", slots))
-        seen = slots[..., 5:6]  # validity
-        scores = features @ self.parameters["weight.weight"].T + 1e4 * (seen - 1)
-        weights = torch.softmax(scores, 1) * seen
-        mean = (weights * features).sum(1)
-        return torch.cat([mean, (weights * (features - mean[:, None]).square()).sum(1)], 1)
-
-
-class _Pooled(ImageBasedNeRF):
-    field_type: ClassVar[type[ImageBasedField]] = _PooledField
-
-    def __init__(self, config: ImageBasedConfig) -> None:
-        super().__init__(config)
-        self.of_view, self.weight = nn.Linear(self.slot_size, POOLED), nn.Linear(POOLED, 1, bias=False)
-
-    @property
-    def slot_size(self) -> int:
-        return READ
-
-    @property
-    def views_size(self) -> int:
-        return 2 * POOLED
-
-    def bind(self, *given: Any) -> ImageBasedField:
-        made = super().bind(*given)
-        return self.field_type(made.target, made.parameters, made.planes, made.bounds)
-
-
-CHANNELS = 8  # of an encoder of the views
-
-
-class _FeatureField(ImageBasedField):
-    """Beside the colours, the features of a convolutional encoder are looked up."""
-
-    def slots(self, points: Tensor, seen: ChosenViews, colours: Tensor) -> Tensor:
-        features = self._feature_planes.lookup(points).colours
-        features = features.gather(1, seen.views[..., None].expand(-1, -1, CHANNELS)) * seen.valid[..., None]
-        return torch.cat([super().slots(points, seen, colours), features], -1)
-
-    @cached_property
-    @torch.enable_grad()  # densities are asked for first, without gradients
-    def _feature_planes(self) -> ImagePlanes:
-        planes, weights = self.planes.colours, self.parameters
-        value = relu(conv2d(2 * planes.images - 1, weights["encoder.0.weight"], weights["encoder.0.bias"], padding=1))
-        value = conv2d(value, weights["encoder.2.weight"], weights["encoder.2.bias"], padding=2, dilation=2)
-        return ImagePlanes(value, planes.cameras)
-
-
-class _WithFeatures(ImageBasedNeRF):
-    def __init__(self, config: ImageBasedConfig) -> None:
-        super().__init__(config)
-        layers = (nn.Conv2d(3, 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, CHANNELS, 3, padding=2, dilation=2))
-        self.encoder = nn.Sequential(*layers)
-
-    @property
-    def views_size(self) -> int:
-        return (READ + CHANNELS) * self.config.planes
-
-    def bind(self, *given: Any) -> ImageBasedField:
-        made = super().bind(*given)
-        return _FeatureField(made.target, made.parameters, made.planes, made.bounds)
-
-
-class _PooledFeatureField(_PooledField, _FeatureField):
-    """Both."""
-
-
-class _PooledWithFeatures(_Pooled, _WithFeatures):
-    field_type: ClassVar[type[ImageBasedField]] = _PooledFeatureField
-
-    @property
-    def slot_size(self) -> int:
-        return READ + CHANNELS
 
 
 @dataclass(frozen=True)
@@ -206,9 +120,6 @@ VARIANTS: dict[str, type[ImageBasedNeRF]] = {
     "without_order": _WithoutOrder,
     "without_blending": _WithoutBlending,
     "random_start": _RandomStart,
-    "pooled": _Pooled,
-    "features": _WithFeatures,
-    "pooled_features": _PooledWithFeatures,
 }
 
 

@@ -298,9 +298,6 @@ VARIANTS = {
     "without_order": "views of a point in the order of the object's, not sorted",
     "without_blending": "colours by the network alone, not blended",
     "random_start": "first weights at random, not those of the hull",
-    "pooled": "views of a point pooled: mean and variance of learned features, as in IBRNet",
-    "features": "with features of a convolutional encoder beside the colours",
-    "pooled_features": "pooled, with features",
 }
 """What is changed, by the names in rows of image_based."""
 

@@ -40,19 +40,6 @@ def test_every_weight_of_every_variant_is_trained(name):
     assert not {key for key in dead if not key.startswith("hypernetwork")}, name
 
 
-def test_pooling_reads_the_views_of_a_point_in_no_order():
-    made = image_based.configured("pooled", 4, 0)
-    model = HyperPlanes(replace(made.model, hull_resolution=16))
-    task = Balls(views=6, size=(24, 24)).task("train0")
-    field = model.adapt(task.support).field
-    slots = torch.randn(5, 4, 9).index_fill_(2, torch.tensor(5), 1.0)
-    torch.testing.assert_close(field.joined(slots), field.joined(slots[:, [2, 0, 3, 1]]))
-    slots[:, 1, 5] = 0.0  # a view that does not see the point counts nothing
-    changed = slots.clone()
-    changed[:, 1, :3] = 7.0
-    torch.testing.assert_close(field.joined(slots), field.joined(changed))
-
-
 def test_a_whole_update_as_parts_of_it_is_that_of_the_model():
     model, task = HyperPlanes(MODEL), Balls(views=6, size=(24, 24)).task("train0")
     found = views.METHODS["unstacked"](model).adapt(task.support)  # outputs start at zero: nothing to leave out

@@ -115,12 +115,7 @@ class ImageBasedNeRF(Target):
     def input_size(self) -> int:
         """The encoded point, what the best views show, and what all of them have in common."""
         config = self.config
-        return encoded_size(config.point_frequencies) + self.views_size + OVERALL + config.grid
-
-    @property
-    def views_size(self) -> int:
-        """How many numbers the trunk reads of the single views of a point."""
-        return READ * self.config.planes
+        return encoded_size(config.point_frequencies) + READ * config.planes + OVERALL + config.grid
 
     @property
     def fine_tuning_rates(self) -> Mapping[str, float]:
@@ -298,7 +293,7 @@ class ImageBasedField(Field):
         config, seen = self.target.config, visibility.best
         # what each of the best views shows, from [0, 1] to [-1, 1]: (point, chosen, 3), then (point, chosen, READ)
         colours = (2 * _of(shown, seen.views) - 1) * seen.valid[..., None]
-        slots = self.slots(points, seen, colours)
+        slots = torch.cat([colours, _described(seen), seen.directions * seen.valid[..., None]], -1)
 
         # what they have in common: mean, variance, difference to the best, least coverage, number of views
         weights = seen.weights[..., None]
@@ -309,24 +304,8 @@ class ImageBasedField(Field):
 
         # the encoded point, the views one after the other, what they have in common, the grid
         inputs = [encode(self.bounds.normalise(points), config.point_frequencies)]
-        inputs += [self.joined(slots), *overall, *self._features(points)]
+        inputs += [_padded(slots, config.planes).flatten(1), *overall, *self._features(points)]
         return self.trunk(torch.cat(inputs, 1))
-
-    def slots(
-        self, points: Float[Tensor, "point 3"], seen: ChosenViews, colours: Float[Tensor, "point chosen 3"]
-    ) -> Float[Tensor, "point chosen number"]:
-        """What the trunk reads of each of the best views; zero where a view is not valid.
-
-        Args:
-            points: in the world.
-            seen: the views.
-            colours: of the points there, in [-1, 1].
-        """
-        return torch.cat([colours, _described(seen), seen.directions * seen.valid[..., None]], -1)
-
-    def joined(self, slots: Float[Tensor, "point chosen number"]) -> Float[Tensor, "point views_size"]:
-        """What the trunk reads of all of them: one after the other, the best first."""
-        return _padded(slots, self.target.config.planes).flatten(1)
 
     def _density(self, hidden: Tensor, coverage: Tensor) -> Float[Tensor, " point"]:
         weight, bias = self.parameters["density.weight"][0], self.parameters["density.bias"]
@@ -360,13 +339,8 @@ class ImageBasedField(Field):
         # the network's factor of each weight, as a logarithm, and its shift of the logit of the colour
         factors, shift = self.layer("colour", relu(value, inplace=True)).split([self.target.config.blended, 3], 1)
         weights = torch.softmax(weights + factors[:, : weights.shape[1]], 1)
-        return torch.sigmoid(torch.logit(self.blended(weights, colours), 0.005) + shift)
-
-    def blended(
-        self, weights: Float[Tensor, "point chosen"], colours: Float[Tensor, "point chosen 3"]
-    ) -> Float[Tensor, "point 3"]:
-        """The mean of the colours, by weights that sum to one."""
-        return (weights[..., None] * colours).sum(1)
+        mean = (weights[..., None] * colours).sum(1)
+        return torch.sigmoid(torch.logit(mean, 0.005) + shift)
 
 
 def _of(colours: Float[Tensor, "point view 3"], views: Int[Tensor, "point chosen"]) -> Float[Tensor, "point chosen 3"]:
