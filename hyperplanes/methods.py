@@ -53,18 +53,18 @@ class Request:
 
     Attributes:
         name: as it was asked for, such as "hyperplanes_100".
-        steps: gradient steps on the support views of an object, "auto", or None where the name has no number.
         checkpoints: folders by the names of the methods that trained them, such as "hyperplanes".
         device: where weights go.
         settings: of fine-tuning.
-        objects: the support views of the objects that will be asked for.
+        objects: the support views of the objects that will be asked for; "hyperplanes_swapped" reads them.
         preset: the shape of fields that need no checkpoint, or its name.
-        protocol: how those are sampled while they are optimised.
+        protocol: how those are sampled while they are optimised, as in `presets.configure`.
         reflections: whether models may be shown views of a symmetric object together with their reflections.
+        steps: gradient steps on the support views of an object, "auto", or None where the name has no number;
+            `make_method` reads them from the name.
     """
 
     name: str
-    steps: Steps | None = None
     checkpoints: Mapping[str, Path] = field(default_factory=dict)
     device: torch.device | str = "cpu"
     settings: FineTuning = field(default_factory=FineTuning)
@@ -72,6 +72,7 @@ class Request:
     preset: str | Preset = "quick"
     protocol: str = "default"
     reflections: bool = True
+    steps: Steps | None = None
 
     def configured(self, method: str) -> ModelConfig:
         """The model of a method at the scale of the preset."""
@@ -305,35 +306,14 @@ def describe_method(name: str) -> str:
     return method.describe(steps)
 
 
-def make_method(
-    name: str,
-    checkpoints: Mapping[str, Path],
-    *,
-    device: torch.device | str = "cpu",
-    settings: FineTuning | None = None,
-    objects: Iterable[Views] = (),
-    preset: str | Preset = "quick",
-    protocol: str = "default",
-    reflections: bool = True,
-) -> Adapter:
+def make_method(request: Request) -> Adapter:
     """The adapter behind a method's name.
-
-    Args:
-        name: of a method, perhaps with a number of steps.
-        checkpoints: folders by the names of the methods that trained them, such as "hyperplanes".
-        device: where its weights go.
-        settings: of fine-tuning.
-        objects: the support views of the objects that will be asked for; "hyperplanes_swapped" reads them.
-        preset: the shape of the fields that need no checkpoint, or its name.
-        protocol: how those are sampled while they are optimised, as in `Preset.by_protocol`.
-        reflections: whether models may be shown views of a symmetric object together with their reflections.
 
     Returns:
         An adapter; ValueError for an unknown name, or a checkpoint that the method needs and that is not given.
     """
-    _, method, steps = _parse(name)
-    settings = settings or FineTuning()
-    return method.make(Request(name, steps, checkpoints, device, settings, objects, preset, protocol, reflections))
+    _, method, steps = _parse(request.name)
+    return method.make(replace(request, steps=steps))
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def test_the_template_of_a_package_adds_its_field_and_its_method(monkeypatch, tm
 
     from hyperplanes.adaptation import FineTuning, HyperPlanes
     from hyperplanes.configuration.presets import PRESETS, preset
-    from hyperplanes.methods import describe_method, make_method
+    from hyperplanes.methods import Request, describe_method, make_method
     from hyperplanes.utilities import entry_points
     from tests.reference_rendering import ball_views, ring, small_model
 
@@ -75,7 +75,7 @@ def test_the_template_of_a_package_adds_its_field_and_its_method(monkeypatch, tm
     )
 
     assert describe_method("symmetric_scratch_3") == "a symmetric NeRF of one object from random weights, 3 steps"
-    field = make_method("symmetric_scratch_3", {}, settings=FineTuning(rays=16)).adapt(ball_views(ring(4)))
+    field = make_method(Request("symmetric_scratch_3", settings=FineTuning(rays=16))).adapt(ball_views(ring(4)))
     points = torch.rand(20, 3) - 0.5
     torch.testing.assert_close(field.density(points), field.density(points * torch.tensor([-1.0, 1.0, 1.0])))
     HyperPlanes(preset("quick").by_method("symmetric").model).save(tmp_path)

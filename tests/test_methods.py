@@ -25,7 +25,7 @@ from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.evaluation import evaluate
 from hyperplanes.hypernetwork import AutoencoderConfig
-from hyperplanes.methods import METHODS, at_steps, describe_method, make_method
+from hyperplanes.methods import METHODS, Request, at_steps, describe_method, make_method
 from tests.reference_rendering import Balls, awaken, small_model
 
 
@@ -48,7 +48,7 @@ def test_methods_by_name(folders):
     data = Balls(test=2)
     objects = [data.task(name).support for name in data.names("test")]
     made = {
-        name: make_method(name, folders, objects=objects)
+        name: make_method(Request(name, folders, objects=objects))
         for name in (*METHODS, "hyperplanes_swapped")
         if not name.endswith("scratch")
     }
@@ -65,8 +65,8 @@ def test_methods_by_name(folders):
 def test_methods_do_without_reflections_where_they_are_told_to():
     packaged = {"hyperplanes": find_checkpoint(Path("small"))}
     for reflections in (True, False):
-        made = make_method("hyperplanes", packaged, reflections=reflections)
-        tuned = make_method("scratch_2", packaged, reflections=reflections)
+        made = make_method(Request("hyperplanes", packaged, reflections=reflections))
+        tuned = make_method(Request("scratch_2", packaged, reflections=reflections))
         assert made.config.symmetric == tuned.model.config.symmetric == reflections
 
 
@@ -74,7 +74,7 @@ def test_methods_do_without_reflections_where_they_are_told_to():
 @pytest.mark.parametrize("steps", [1, 37, "auto"])
 def test_any_number_of_fine_tuning_steps(folders, name, steps):
     settings = FineTuning(rays=7)
-    made = make_method(f"{name}_{steps}", folders, settings=settings)
+    made = make_method(Request(f"{name}_{steps}", folders, settings=settings))
     assert isinstance(made, FromScratch if name == "scratch" else FineTuned)
     assert (made.steps, made.settings) == (steps, settings)
 
@@ -82,7 +82,7 @@ def test_any_number_of_fine_tuning_steps(folders, name, steps):
 @pytest.mark.parametrize("name", ["magic", "scratch", "nearest_view_10", "hyperplanes_swapped_3", "hyperplanes_", ""])
 def test_unknown_methods_are_refused(name):
     with pytest.raises(ValueError, match=f"method: expected one of nearest_view, .*, got '{name}'"):
-        make_method(name, {})
+        make_method(Request(name))
 
 
 @pytest.mark.parametrize(
@@ -91,13 +91,13 @@ def test_unknown_methods_are_refused(name):
 )
 def test_missing_checkpoints_are_named(name, family):
     with pytest.raises(ValueError, match=f"method {name}: expected a checkpoint of {family}, got none"):
-        make_method(name, {})
+        make_method(Request(name))
 
 
 @pytest.mark.parametrize("name", ["mv_meta_2", "maml", "standard", "mv_shuffled"])
 def test_of_a_learned_initialisation_only_the_weights_are_optimised(folders, name):
     with pytest.raises(ValueError, match=f"fine_tune: expected weights for {name}, .*, got hypernetwork"):
-        make_method(name, folders, settings=FineTuning(trainable="hypernetwork"))
+        make_method(Request(name, folders, settings=FineTuning(trainable="hypernetwork")))
 
 
 def test_every_method_in_words():
@@ -165,8 +165,8 @@ def test_no_method_reads_a_pixel_of_the_query_views(folders, monkeypatch):
     data.task = poisoned
     objects = [data.task(name).support for name in data.names("test")]
     for name in (f"{name}_2" if name.endswith("scratch") else name for name in METHODS):
-        adapter = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))
+        adapter = make_method(Request(name, folders, objects=objects, settings=FineTuning(rays=16)))
         evaluate(name, adapter, data, ["test0"], lambda score, task, pictures, field: read.append(pictures.images))
-        again = make_method(name, folders, objects=objects, settings=FineTuning(rays=16))
+        again = make_method(Request(name, folders, objects=objects, settings=FineTuning(rays=16)))
         shown = again.adapt(clean.task("test0").support).render(clean.task("test0").query[:1].cameras).images
         assert torch.equal(read[-1], shown), name

@@ -133,7 +133,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.evaluation.partial_results import PartialResults
     from hyperplanes.evaluation.perceptual import LPIPS
     from hyperplanes.evaluation.tables import PAIR_HEADINGS, compared_rows, headings, rows
-    from hyperplanes.methods import WithSampler, at_steps, make_method
+    from hyperplanes.methods import Request, WithSampler, at_steps, make_method
     from hyperplanes.utilities.plots import figure_kind
 
     if not arguments.method:
@@ -169,7 +169,7 @@ def run(arguments: Arguments) -> int:
 
     def make(name: str, seed: int) -> WithSampler:
         objects = _supports(data, names)
-        made = make_method(
+        request = Request(
             name,
             checkpoints[seed],
             device=device,
@@ -178,7 +178,7 @@ def run(arguments: Arguments) -> int:
             preset=arguments.preset,
             protocol=arguments.protocol,
         )
-        return WithSampler(made, sampling)
+        return WithSampler(make_method(request), sampling)
 
     chosen = list(dict.fromkeys(each for name in arguments.method for each in at_steps(name, arguments.steps)))
     first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to

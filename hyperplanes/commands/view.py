@@ -129,13 +129,16 @@ def run(arguments: Arguments) -> int:
 def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
     """The methods to compare with, by name."""
     from hyperplanes.adaptation.checkpoints import find_checkpoint
-    from hyperplanes.methods import make_method
+    from hyperplanes.methods import Request, make_method
 
     if not arguments.compare:
         return {}
     checkpoints = {"hyperplanes": find_checkpoint(arguments.checkpoint)} if not arguments.checkpoint.is_file() else {}
     reflections = not arguments.no_reflections
-    return {name: make_method(name, checkpoints, device=device, reflections=reflections) for name in arguments.compare}
+    return {
+        name: make_method(Request(name, checkpoints, device=device, reflections=reflections))
+        for name in arguments.compare
+    }
 
 
 def _show_others(

@@ -28,7 +28,7 @@ from hyperplanes.experiments.trainings import Train, Trainings
 from hyperplanes.experiments.workers import Result, Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.export.images import orbit_cameras, picture_paths, save_images
-from hyperplanes.methods import Unchecked, WithSampler, make_method
+from hyperplanes.methods import Request, Unchecked, WithSampler, make_method
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.environment import find_processor
 from hyperplanes.utilities.writing import write_json
@@ -281,7 +281,7 @@ class Runner:
         tasks, views = self.data.tasks(cell.on), self._views(cell, checkpoint)
         tasks = WithSupport(tasks, views) if cell.query is None else Shown(tasks, views, cell.query)
         names = self.data.evaluated(cell.on, cell.split, experiment.objects)
-        adapter = make_method(
+        request = Request(
             method,
             checkpoints,
             device=self.device,
@@ -290,7 +290,7 @@ class Runner:
             preset=scaled_preset(experiment, self.scale),
         )
         sampling = None if cell.trained.packaged else PROTOCOLS[self.scale.protocol]
-        return WithSampler(Unchecked(adapter), sampling), tasks
+        return WithSampler(Unchecked(make_method(request)), sampling), tasks
 
     def fine_tuning(self, cell: Cell) -> FineTuning:
         """Rays, optimiser and rates of the gradient steps of a cell; a learned initialisation states its own."""

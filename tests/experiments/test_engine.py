@@ -17,7 +17,7 @@ from hyperplanes.data import open_dataset
 from hyperplanes.data.support import WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.experiments import EXPERIMENTS, SCALES
-from hyperplanes.methods import make_method
+from hyperplanes.methods import Request, make_method
 from hyperplanes.rendering import Hierarchical
 
 CLASSES = ("car", "chair", "lamp", "plane")
@@ -117,7 +117,7 @@ def test_a_cell_is_the_evaluation_of_its_checkpoint(out, cars, reproduced):
         for path in (out / "trainings").glob("car-*-hyperplanes-0-*/model.json")
         if json.loads(path.read_text())["target"] == "nerf"
     )
-    adapter = make_method("hyperplanes", {"hyperplanes": folder})
+    adapter = make_method(Request("hyperplanes", {"hyperplanes": folder}))
     score = evaluate("hyperplanes", adapter, data, data.names("test")[:1])
     assert table["PSNR"]["NeRF"]["value"] == pytest.approx(score.mean("psnr"), abs=1e-4)
     assert table["SSIM"]["NeRF"]["value"] == pytest.approx(score.mean("ssim"), abs=1e-4)
@@ -134,7 +134,7 @@ def test_what_a_cell_fine_tunes_is_what_its_column_says(out, cars, reproduced):
     data = WithSupport(open_dataset(cars), 4)
     for column, trainable in (("HyperPlanes-100", "hypernetwork"), ("HyperPlanes-100, all weights", "weights")):
         settings = replace(SCALES["smoke"].fine_tuning, trainable=trainable)
-        adapter = make_method("hyperplanes_2", {"hyperplanes": folder}, settings=settings)
+        adapter = make_method(Request("hyperplanes_2", {"hyperplanes": folder}, settings=settings))
         score = evaluate("hyperplanes_2", adapter, data, data.names("test")[:1])
         assert row[column]["value"] == pytest.approx(score.mean("psnr"), abs=1e-4)
     values = [row[column]["value"] for column in row if column.startswith("HyperPlanes")]

@@ -14,7 +14,7 @@ from hyperplanes.adaptation import InitialisationConfig
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.evaluation import evaluate
-from hyperplanes.methods import make_method
+from hyperplanes.methods import Request, make_method
 from hyperplanes.training import TrainingConfig
 from hyperplanes.training.initialisation import initialisation_trainer
 from hyperplanes.views import Task
@@ -49,7 +49,7 @@ def meta(tmp_path_factory):
 
 @cache
 def quality(name, folder, seed=0):
-    method = make_method(name, {"mv_meta": folder}, settings=FineTuning(seed=seed))
+    method = make_method(Request(name, {"mv_meta": folder}, settings=FineTuning(seed=seed)))
     return evaluate(name, method, Balls(), ["test0"]).mean("psnr")
 
 

@@ -19,7 +19,7 @@ from hyperplanes.configuration.presets import PRESETS, preset
 from hyperplanes.configuration.settings_file import changed, document, parse_options, read_experiment, write_experiment
 from hyperplanes.fields import ImageBasedConfig, NeRF, TargetConfig, find_targets
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
-from hyperplanes.methods import Method, describe_method, make_method
+from hyperplanes.methods import Method, Request, describe_method, make_method
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.utilities import entry_points
 from hyperplanes.utilities.checkpoints import CheckpointError
@@ -318,7 +318,7 @@ def test_a_field_of_another_package_is_trained_saved_and_loaded(other_package, t
     assert isinstance(model.networks["fine"], Constant)
     model.save(tmp_path)
     assert isinstance(HyperPlanes.from_pretrained(tmp_path).networks["fine"], Constant)
-    made = make_method("constant_10", find_checkpoints([tmp_path]))
+    made = make_method(Request("constant_10", find_checkpoints([tmp_path])))
     assert isinstance(made, FineTuned)
     assert isinstance(made.model.networks["fine"], Constant)
     assert describe_method("constant_10") == "constant after 10 fine-tuning steps"
@@ -326,14 +326,14 @@ def test_a_field_of_another_package_is_trained_saved_and_loaded(other_package, t
 
 def test_a_method_of_another_package_is_made_and_described(other_package):
     assert describe_method("copycat") == "the nearest support view, from another package"
-    assert isinstance(make_method("copycat", {}), NearestView)
+    assert isinstance(make_method(Request("copycat")), NearestView)
     assert describe_method("copycat_7") == "the nearest support view, from another package, 7 steps"
-    assert isinstance(make_method("copycat_auto", {}), NearestView)
-    assert isinstance(make_method("copycat_swapped", {}), HullBlend)
+    assert isinstance(make_method(Request("copycat_auto")), NearestView)
+    assert isinstance(make_method(Request("copycat_swapped")), HullBlend)
     with pytest.raises(ValueError, match="copycat"):
-        make_method("unheard_of", {})
+        make_method(Request("unheard_of"))
     with pytest.raises(ValueError, match=r"got 'copycats'; did you mean copycat\?"):
-        make_method("copycats", {})
+        make_method(Request("copycats"))
 
 
 def test_names_that_other_packages_bring_are_in_the_help(monkeypatch, capsys):
