@@ -1,4 +1,4 @@
-"""Transmittance inside a grid of voxels: ray marching compiled by numba on the CPU, plain PyTorch elsewhere."""
+"""Transmittance inside a grid of voxels: ray marching compiled by numba, on the CPU."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from hyperplanes.geometry.kernels.compiling import compile_function
 from hyperplanes.geometry.kernels.threads import parallel_for
 
-__all__ = ["transmittance", "transmittance_torch"]
+__all__ = ["transmittance"]
 
 CELLS = 1 << 12  # that are processed together
 MAX_OPTICAL_DEPTH = 12.0  # beyond it the transmittance is zero in single precision
@@ -32,32 +32,12 @@ def transmittance(
         directions: unit vectors from outside towards the voxels.
 
     Returns:
-        Transmittances in [0, 1].
+        Transmittances in [0, 1], on the device of the grid.
     """
-    if optical_depth.device.type != "cpu":
-        return transmittance_torch(optical_depth, cells, directions)
     found, kernel = torch.empty(len(cells), len(directions)), compile_function(_transmittance)
-    arrays = (optical_depth.contiguous().numpy(), cells.contiguous().numpy(), directions.contiguous().numpy())
+    arrays = [each.cpu().contiguous().numpy() for each in (optical_depth, cells, directions)]
     parallel_for(lambda start, stop: kernel(*arrays, found.numpy(), start, stop), len(cells), CELLS)
-    return found
-
-
-def transmittance_torch(
-    optical_depth: Float[Tensor, "x y z"], cells: Int[Tensor, "cell 3"], directions: Float[Tensor, "direction 3"]
-) -> Float[Tensor, "cell direction"]:
-    """As `transmittance`, on any device: all cells step by step."""
-    found = torch.empty(len(cells), len(directions), device=optical_depth.device)
-    side, flat = optical_depth.shape[0], optical_depth.flatten()
-    for start in range(0, len(cells), CELLS):
-        total = torch.zeros_like(found[start : start + CELLS])
-        centres = cells[start : start + CELLS, None].float() + 0.5
-        for step in range(math.ceil(math.sqrt(3) * side)):
-            here = (centres - (step + 1) * directions).floor().long()
-            inside = ((here >= 0) & (here < side)).all(-1)
-            here = here.clamp(0, side - 1)
-            total += flat[(here[..., 0] * side + here[..., 1]) * side + here[..., 2]] * inside
-        found[start : start + CELLS] = torch.exp(-total)
-    return found
+    return found.to(optical_depth.device)
 
 
 @no_type_check
