@@ -28,6 +28,10 @@ Array = Float[np.ndarray, "..."]
 HALF_ROOM = 6.0  # from the origin to its walls
 AXES = np.array([0.75, 0.55, 0.5])  # of the ellipsoid
 LIGHT = np.array([0.4, 0.8, 0.45])
+FOCAL = 1.15  # focal length in units of the longer side
+EXPOSURE = 0.12  # standard deviation of the logarithm of each photograph's brightness
+BLUR = 0.5  # largest standard deviation of a photograph's blur, in pixels
+NOISE = 0.01  # standard deviation of the noise of a grey pixel, of 1
 
 
 @dataclass(frozen=True)
@@ -98,10 +102,6 @@ def stage(
     seed: int,
     mesh: Mesh | None = None,
     lens: tuple[float, float] = (-0.08, 0.02),
-    exposure: float = 0.12,
-    blur: float = 0.5,
-    noise: float = 0.01,
-    focal: float = 1.15,
     samples: int = 2,
     octaves: int = 6,
 ) -> Staged:
@@ -113,19 +113,14 @@ def stage(
         seed: of textures, exposures, blur and noise.
         mesh: the object; an ellipsoid when None.
         lens: k1 and k2 of the camera.
-        exposure: standard deviation of the logarithm of each photograph's brightness.
-        blur: largest standard deviation of a photograph's blur, in pixels.
-        noise: standard deviation of the noise of a grey pixel, of 1.
-        focal: focal length in units of the longer side.
         samples: along a side of a pixel, of the room and the ellipsoid.
         octaves: of the noise that room and table are painted with; fewer leave out the finest details.
     """
     generator = np.random.default_rng(seed)
     texture = generator.random((32, 32, 32, 3)).astype(np.float32)
     height, width = size
-    calibration = np.array(
-        [[focal * max(size), 0, (width - 1) / 2], [0, focal * max(size), (height - 1) / 2], [0, 0, 1.0]]
-    )
+    focal = FOCAL * max(size)
+    calibration = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
     drawn, floor = _drawn(mesh, poses, calibration, size)
     source = _lens_source(size, calibration, lens)
     rows, columns = np.mgrid[: height * samples, : width * samples]
@@ -139,9 +134,9 @@ def stage(
             over = _through_lens(drawn[view].astype(np.float32) / 255, source)
             colour = over[..., :3] + colour * (1 - over[..., 3:])
             mask = over[..., 3]
-        colour = colour * np.exp(generator.normal(0, exposure))
-        colour = ndimage.gaussian_filter(colour, (*(generator.uniform(0, blur),) * 2, 0))
-        colour = colour + generator.normal(0, noise, colour.shape) * np.sqrt(colour.clip(0.02) / 0.5)
+        colour = colour * np.exp(generator.normal(0, EXPOSURE))
+        colour = ndimage.gaussian_filter(colour, (*(generator.uniform(0, BLUR),) * 2, 0))
+        colour = colour + generator.normal(0, NOISE, colour.shape) * np.sqrt(colour.clip(0.02) / 0.5)
         photographs.append((colour.clip(0, 1) * 255).round().astype(np.uint8))
         masks.append(mask > 0.5)
     return Staged(photographs, masks, poses, calibration, lens)

@@ -46,14 +46,13 @@ def refine(
     density: Callable[[Tensor], Tensor],
     *,
     opacity_loss: float = 0.05,
-    margin: int = 1,
     margin_loss: float | None = None,
 ) -> RefinedOccupancy:
     """The voxels of a grid in which a field is not empty.
 
     The density is evaluated at the centre of every occupied voxel that does not lie behind opaque ones, then, in voxels
     that are to be dropped, at the centres of their eighths, half a voxel apart. Voxels above the threshold are dilated
-    by `margin` voxels and never beyond the grid that was given. What is kept of an object with sharp borders:
+    by one voxel, the margin, and never beyond the grid that was given. What is kept of an object with sharp borders:
 
     - in a grid of up to 60,000 occupied voxels, such as a visual hull: whatever is at least half a voxel thick;
     - in a larger one (no masks, so no hull), which is evaluated at half its resolution first: what is two voxels thick,
@@ -69,7 +68,6 @@ def refine(
         occupancy: the voxels to evaluate, such as the visual hull.
         density: world points (point, 3) -> density per world unit (point,).
         opacity_loss: upper bound of the opacity that a ray loses, if all dropped voxels lay along it.
-        margin: voxels to dilate by.
         margin_loss: `opacity_loss` of the margin, of which voxels are kept that reach its density where they are next
             to the voxels that were found; absent, all of the margin is kept.
 
@@ -83,23 +81,23 @@ def refine(
     # of large grids only what a grid of half the resolution keeps is asked
     if large:
         halved = _halved(occupancy)
-        coarse = _dilated(halved, _from_outside(halved, halved.occupied, density) > 2 * least, margin)
+        coarse = _dilated(halved, _from_outside(halved, halved.occupied, density) > 2 * least)
         asked = (
             asked & coarse.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)[:side, :side, :side]
         )
     optical_depth = _from_outside(occupancy, asked, density)
     filled = optical_depth > least
-    kept, divided = _dilated(occupancy, filled, margin), torch.zeros_like(filled)
+    kept, divided = _dilated(occupancy, filled), torch.zeros_like(filled)
     # what lies between the centres: voxels beside those that are kept are asked in eight places
     while True:
-        near = _dilated(occupancy, kept, 1) if large else occupancy.occupied
+        near = _dilated(occupancy, kept) if large else occupancy.occupied
         asked = near & occupancy.occupied & ~kept & ~divided
         divided |= asked
         found = _filled(occupancy, asked, density, threshold)
         if not found.any():
             break
         filled = filled | found
-        kept = kept | _dilated(occupancy, found, margin)
+        kept = kept | _dilated(occupancy, found)
     if margin_loss is not None:
         kept = _trimmed(Occupancy(kept, bounds), filled, density, _density_of(margin_loss, occupancy))
     return RefinedOccupancy(kept, bounds, optical_depth)
@@ -179,12 +177,12 @@ def _filled(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor],
     return filled
 
 
-def _dilated(grid: Occupancy, filled: Tensor, margin: int) -> Tensor:
-    """Filled voxels grown by some, within the grid."""
+def _dilated(grid: Occupancy, filled: Tensor) -> Tensor:
+    """Filled voxels and those beside them, within the grid."""
     box, _ = _box_of(filled)
-    box = tuple(slice(max(0, each.start - margin), each.stop + margin) for each in box)
+    box = tuple(slice(max(0, each.start - 1), each.stop + 1) for each in box)
     result = torch.zeros_like(filled)
-    result[box] = dilate(filled[box], margin) & grid.occupied[box]
+    result[box] = dilate(filled[box]) & grid.occupied[box]
     return result
 
 
