@@ -58,7 +58,7 @@ class Request:
         settings: of fine-tuning.
         objects: the support views of the objects that will be asked for; "hyperplanes_swapped" reads them.
         preset: the shape of fields that need no checkpoint, or its name.
-        protocol: how those are sampled while they are optimised, as in `presets.configure`.
+        protocol: how those are sampled while they are optimised, as in `Preset.by_protocol`.
         reflections: whether models may be shown views of a symmetric object together with their reflections.
         steps: gradient steps on the support views of an object, "auto", or None where the name has no number;
             `make_method` reads them from the name.
