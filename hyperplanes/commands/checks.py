@@ -2,43 +2,23 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, entry_points, version
+from importlib.metadata import PackageNotFoundError, entry_points, requires, version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hyperplanes.utilities.environment import usable_cores
 
-__all__ = ["REQUIRED", "Check", "examine", "healthy"]
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
 
-REQUIRED = {
-    "kornia": "kornia",
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "skimage": "scikit-image",
-    "trimesh": "trimesh",
-    "manifold3d": "manifold3d",
-    "mapbox_earcut": "mapbox-earcut",
-    "xatlas": "xatlas",
-    "safetensors": "safetensors",
-    "jaxtyping": "jaxtyping",
-    "PIL": "pillow",
-    "matplotlib": "matplotlib",
-    "jinja2": "jinja2",
-    "networkx": "networkx",
-    "collada": "pycollada",
-    "fast_simplification": "fast-simplification",
-    "lightning_fabric": "lightning-fabric",
-    "rich": "rich",
-    "tyro": "tyro",
-    "yaml": "pyyaml",
-    "charset_normalizer": "charset-normalizer",
-}
-"""What everything needs: modules and the packages they come from."""
+__all__ = ["Check", "examine", "healthy"]
 
 OPTIONAL = {
     "tensorboard": ("watch", "train --tensorboard"),
@@ -116,12 +96,25 @@ def _torch() -> Check:
 
 
 def _packages() -> Check:
-    missing = [package for module, package in REQUIRED.items() if find_spec(module) is None]
-    if missing:
-        return Check("packages", False, True, f"missing: {', '.join(missing)}", f"pip install {' '.join(missing)}")
+    from packaging.requirements import Requirement
+
+    required = [Requirement(line) for line in requires("hyperplanes") or ()]
+    here = [each for each in required if each.marker is None or each.marker.evaluate({"extra": ""})]
+    unmet = [f"{each.name}{each.specifier}" for each in here if not _is_met(each)]
+    if unmet:
+        return Check(
+            "packages", False, True, f"missing or too old: {', '.join(unmet)}", shlex.join(["pip", "install", *unmet])
+        )
     return Check(
-        "packages", True, True, ", ".join(f"{name} {_version(name)}" for name in ("kornia", "trimesh", "numpy"))
+        "packages", True, True, ", ".join(f"{name} {version(name)}" for name in ("kornia", "trimesh", "numpy"))
     )
+
+
+def _is_met(requirement: Requirement) -> bool:
+    try:
+        return requirement.specifier.contains(version(requirement.name), prereleases=True)
+    except PackageNotFoundError:
+        return False
 
 
 def _lookups() -> list[Check]:
