@@ -1,8 +1,8 @@
 """Which renderer works on this machine: each is probed by drawing a triangle in a subprocess.
 
-Order: what the caller or the environment names; pyrender on EGL; pyrender on OSMesa; Embree ray casting, which needs
-nothing beyond the installed packages. A library that is missing, a driver that crashes and a driver that draws nothing
-all show in the subprocess, and none of them can crash the calling process.
+Order: pyrender on EGL; pyrender on OSMesa; Embree ray casting, which needs nothing beyond the installed packages. A
+library that is missing, a driver that crashes and a driver that draws nothing all show in the subprocess, and none of
+them can crash the calling process.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import sys
 from dataclasses import dataclass
 
 __all__ = [
-    "CHOICE_VARIABLE",
     "REMEDIES",
     "RENDERERS",
     "ProbeResult",
@@ -27,9 +26,6 @@ __all__ = [
 RENDERERS: tuple[str, ...] = ("pyrender-egl", "pyrender-osmesa", "embree")
 """Names of the renderers, best first."""
 
-CHOICE_VARIABLE = "HYPERPLANES_RENDERER"
-"""Environment variable by which a user chooses a renderer."""
-
 REMEDIES = {
     "pyrender-egl": "apt-get install -y libegl1 libgl1",
     "pyrender-osmesa": "apt-get install -y libosmesa6 && pip install 'PyOpenGL>=3.1.7'",
@@ -38,7 +34,6 @@ REMEDIES = {
 """The command that should make a renderer work on Debian and Ubuntu."""
 
 _PROBE_SECONDS = 90.0
-_OPENGL_PLATFORMS = {"egl": "pyrender-egl", "osmesa": "pyrender-osmesa"}
 
 
 class RendererError(ValueError):
@@ -93,7 +88,7 @@ def probe(name: str) -> ProbeResult:
         ValueError: if no renderer has that name.
     """
     if name not in RENDERERS:
-        raise ValueError(_unknown(name))
+        raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}")
     if name not in _cache:
         _cache[name] = _run_probe(name)
     return _cache[name]
@@ -109,40 +104,27 @@ def probe_all() -> list[ProbeResult]:
 
 
 def find_renderer(prefer: str | None = None) -> RendererInfo:
-    """Find the best renderer that works here.
-
-    Each is tried once in a process; workers are told the name. Without `prefer` the environment decides:
-    HYPERPLANES_RENDERER names a renderer, which then must work; PYOPENGL_PLATFORM (egl or osmesa) only puts one in
-    front.
+    """Find the best renderer that works here. Each is tried once in a process; workers are told the name.
 
     Args:
-        prefer: one of RENDERERS, which then must work, or None for the best that does.
+        prefer: one of RENDERERS, which then must work, or None for the best that does; another is a ValueError.
 
     Returns:
         The renderer, with advice when a better one could be had.
 
     Raises:
         RendererError: if the renderer named, or every renderer, does not work; the message holds the remedy.
-        ValueError: if no renderer has that name.
     """
-    chosen = prefer or os.environ.get(CHOICE_VARIABLE) or None
-    if chosen is not None and chosen not in RENDERERS:
-        raise ValueError(_unknown(chosen))
-    if chosen is not None:
-        outcome = probe(chosen)
+    if prefer is not None:
+        outcome = probe(prefer)
         if not outcome.works:
             raise RendererError(
-                f"renderer {chosen!r}: expected it to draw a triangle, found: {outcome.message}. "
+                f"renderer {prefer!r}: expected it to draw a triangle, found: {outcome.message}. "
                 f"Remedy: {outcome.remedy}, or choose another of {', '.join(RENDERERS)}"
             )
-        return RendererInfo(chosen, outcome.message)
-    names = list(RENDERERS)
-    first = _OPENGL_PLATFORMS.get(os.environ.get("PYOPENGL_PLATFORM", ""))
-    if first is not None:
-        names.remove(first)
-        names.insert(0, first)
+        return RendererInfo(prefer, outcome.message)
     failures: list[ProbeResult] = []
-    for name in names:
+    for name in RENDERERS:
         outcome = probe(name)
         if outcome.works:
             advice = () if name.startswith("pyrender") else tuple(_advice(failure) for failure in failures)
@@ -152,10 +134,6 @@ def find_renderer(prefer: str | None = None) -> RendererInfo:
         f"no renderer works here ({'; '.join(f'{f.name}: {f.message}' for f in failures)}). "
         f"Remedy: {REMEDIES['pyrender-egl']}, or without root: {REMEDIES['embree']}"
     )
-
-
-def _unknown(name: str) -> str:
-    return f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}"
 
 
 def _advice(failure: ProbeResult) -> str:

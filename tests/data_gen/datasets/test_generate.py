@@ -24,7 +24,6 @@ from data_gen.datasets.generate import PICTURES, GenerationConfig, MeshFolder, P
 from data_gen.datasets.inspect import inspect
 from data_gen.datasets.manifest import verify
 from data_gen.datasets.sources import list_items
-from data_gen.rendering.renderers import CHOICE_VARIABLE, find_renderer
 from data_gen.rigs import RIG_PRESETS, fixed, make_rig
 from hyperplanes.data import DataError, Dataset
 from hyperplanes.data.inspection.describe import describe
@@ -126,7 +125,7 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whol
         [sys.executable, "-c", SCRIPT.format(out=str(out))],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": root, CHOICE_VARIABLE: find_renderer().name},
+        env={**os.environ, "PYTHONPATH": root},
     )
     for _ in range(after):
         process.stdout.readline()

@@ -11,9 +11,7 @@ from data_gen.rendering.renderers import ProbeResult, RendererError, RendererInf
 
 @pytest.fixture
 def fresh(monkeypatch):
-    """No choice in the environment and nothing remembered."""
-    for variable in (renderers.CHOICE_VARIABLE, "PYOPENGL_PLATFORM"):
-        monkeypatch.setenv(variable, "")
+    """Nothing remembered."""
     monkeypatch.setattr(renderers, "_cache", {})
     return monkeypatch
 
@@ -68,19 +66,10 @@ def test_best_is_taken_without_trying_the_rest(pretend):
     assert tried == ["pyrender-egl"]
 
 
-def test_opengl_platform_of_the_user_comes_first(pretend, monkeypatch):
-    tried = pretend("pyrender-egl", "pyrender-osmesa")
-    monkeypatch.setenv("PYOPENGL_PLATFORM", "osmesa")
-    assert renderers.find_renderer().name == "pyrender-osmesa"
-    assert tried == ["pyrender-osmesa"]
-
-
-@pytest.mark.parametrize("by_environment", [False, True])
-def test_choice_must_work(pretend, monkeypatch, by_environment):
+def test_choice_must_work(pretend):
     pretend("embree")
-    monkeypatch.setenv(renderers.CHOICE_VARIABLE, "pyrender-osmesa" if by_environment else "")
     with pytest.raises(RendererError, match="'pyrender-osmesa': .* no library. Remedy: apt-get install -y libosmesa6"):
-        renderers.find_renderer(None if by_environment else "pyrender-osmesa")
+        renderers.find_renderer("pyrender-osmesa")
 
 
 def test_nothing_works(pretend):
