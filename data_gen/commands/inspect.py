@@ -172,7 +172,7 @@ def _inspect(arguments: Arguments, console: Console) -> int:
         )
     out = arguments.out or Path("runs/inspect") / arguments.path.resolve().name
     refuse_sources(out, arguments.path)
-    found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums, trial=True)
+    found = inspect(arguments.path, out, arguments.objects, checksums=arguments.checksums)
     for line in found.lines():
         console.say(line)
     return int(found.has_problems)

@@ -32,14 +32,12 @@ class Inspection:
     Attributes:
         description: `hyperplanes.data.inspection.describe.Description` of the data set.
         files: the pictures that were written.
-        notes: what could not be done and why, one line each.
         verification: of the checksums, where it was requested.
         scene: what the views of a single scene cover, a line a fact.
     """
 
     description: Any
     files: tuple[Path, ...]
-    notes: tuple[str, ...]
     verification: Verification | None = None
     scene: tuple[str, ...] = ()
 
@@ -53,30 +51,20 @@ class Inspection:
     def lines(self) -> list[str]:
         """All of it as text, a line a fact."""
         checked = [] if self.verification is None else self.verification.lines()
-        return [
-            *self.description.lines(),
-            *self.scene,
-            *checked,
-            *(f"wrote {path}" for path in self.files),
-            *self.notes,
-        ]
+        return [*self.description.lines(), *self.scene, *checked, *(f"wrote {path}" for path in self.files)]
 
 
-def inspect(
-    path: str | Path, out: str | Path, objects: int = _OBJECTS, *, checksums: bool = False, trial: bool = False
-) -> Inspection:
-    """Describe a data set, and draw it.
+def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS, *, checksums: bool = False) -> Inspection:
+    """Describe a data set, and draw it; of a single scene with masks also try the packaged model `small`.
 
     Args:
         path: a data set in any layout, or a posed scene.
         out: the folder for contact_sheet.png and cameras.png, and coverage.png of a single scene.
         objects: how many objects to look at.
         checksums: compare every file with its checksum in the manifest, too.
-        trial: of a single scene with masks, try how well the packaged model `small` shows views that it was not shown.
 
     Returns:
-        The description and the files. A data set that cannot be opened is a DataError; without matplotlib there is
-        no cameras.png, and a note.
+        The description and the files. A data set that cannot be opened is a DataError.
     """
     from hyperplanes.data import open_dataset
     from hyperplanes.data.dataset import locate_scene
@@ -86,30 +74,24 @@ def inspect(
 
     data, out = open_dataset(path), Path(out)
     description = describe(data, objects)
-    files, notes, scene = [], [], []
+    files, scene = [], []
     verification = verify(path) if checksums else None
     names = [one.name for one in description.objects]
     if names:
         pictures, labels = _pictures(data, names)
-        files.append(out / "contact_sheet.png")
-        write_whole(
-            files[0], encode_png(contact_sheet(pictures, min(_VIEWS, len(data.posed(names[0]).support)), labels))
-        )
+        support = len(data.posed(names[0]).support)
+        drawings = {"contact_sheet.png": encode_png(contact_sheet(pictures, min(_VIEWS, support), labels))}
         views = _all_views(data, names[0])
         sparse = _sparse(locate_scene(path), data.posed(names[0])) if len(data) == 1 else None
-        report = describe_scene(views, sparse) if len(data) == 1 and len(views) > 1 else None
-        if report is not None:
-            scene = [*report.lines(), *(_trial(views) if trial else [])]
-        try:
-            drawings = {"cameras.png": _cameras(views, len(data.posed(names[0]).support), names[0], sparse)}
-            if report is not None:
-                drawings["coverage.png"] = draw_coverage(report, views)
-            for name, drawing in drawings.items():
-                files.append(out / name)
-                write_whole(files[-1], drawing)
-        except ImportError:
-            notes.append("cameras.png: not drawn, matplotlib is not installed; pip install matplotlib")
-    return Inspection(description, tuple(files), tuple(notes), verification, tuple(scene))
+        drawings["cameras.png"] = _cameras(views, support, names[0], sparse)
+        if len(data) == 1 and len(views) > 1:
+            report = describe_scene(views, sparse)
+            scene = [*report.lines(), *_trial(views)]
+            drawings["coverage.png"] = draw_coverage(report, views)
+        for name, drawing in drawings.items():
+            files.append(out / name)
+            write_whole(files[-1], drawing)
+    return Inspection(description, tuple(files), verification, tuple(scene))
 
 
 def _all_views(data: Any, name: str) -> Any:
@@ -183,12 +165,9 @@ def _cameras(views: Any, support: int, title: str, sparse: Any = None) -> bytes:
         title: of the picture.
         sparse: points of a reconstruction, in the same world; those far away are left out.
     """
-    import io
+    from hyperplanes.utilities.plots import encode_figure, new_figure
 
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 8), dpi=100)
+    figure = new_figure(8, 8)
     axes: Any = figure.add_subplot(projection="3d")
     halves = ((slice(support), "tab:blue", "support"), (slice(support, None), "tab:orange", "query"))
     frusta = _frusta(views)
@@ -213,9 +192,7 @@ def _cameras(views: Any, support: int, title: str, sparse: Any = None) -> bytes:
     axes.set(xlabel="x", ylabel="-z", zlabel="y", title=title)
     axes.set_aspect("equal")
     axes.legend(loc="upper left")
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
-    return buffer.getvalue()
+    return encode_figure(figure, "png")
 
 
 def _frusta(views: Any) -> np.ndarray:
@@ -240,11 +217,6 @@ def _solid(views: Any) -> tuple[np.ndarray, str]:
     from hyperplanes.geometry.cameras import fibonacci_sphere
 
     if views.masks is not None:
-        hull = carve(views.masks, views.cameras, views.bounds, 40)
-        solid = np.pad(hull.occupied.numpy(), 1)
-        inner = np.logical_and.reduce([np.roll(solid, step, axis) for step in (-1, 1) for axis in range(3)])
-        cells = np.argwhere(solid & ~inner) - 1
-        centre = np.array(views.bounds.centre)
-        return (cells + 0.5) * hull.voxel - views.bounds.radius + centre, "visual hull"
+        return carve(views.masks, views.cameras, views.bounds, 40).surface_centres.numpy(), "visual hull"
     sphere = np.linalg.inv(fibonacci_sphere(400, views.bounds.radius).numpy())[:, :3, 3]
     return sphere + np.array(views.bounds.centre), "bounds"

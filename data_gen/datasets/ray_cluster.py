@@ -40,14 +40,9 @@ def run_on_ray(
 
     Yields:
         What `run_workers` yields.
-
-    Raises:
-        ValueError: ray is not installed.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise ValueError("engine: expected ray to be installed, found no such module; pip install ray") from error
+    import ray
+
     started = not ray.is_initialized()
     if started:
         options: dict[str, Any] = {"log_to_driver": False, "runtime_env": {"env_vars": worker_environment()}}
