@@ -14,7 +14,7 @@ from data_gen.datasets.sources import seed_of
 from data_gen.rigs import DEFAULT_DISTANCE, OBJECT_RADIUS, RIG_PRESETS, RIGS, Rig, make_rig
 from hyperplanes.utilities.errors import did_you_mean
 
-__all__ = ["ENGINES", "GenerationConfig", "RenderConfig"]
+__all__ = ["ENGINES", "GenerationConfig"]
 
 ENGINES = ("local", "ray")
 """Where objects are rendered: worker processes of this machine, or a Ray cluster."""
@@ -23,88 +23,7 @@ VIEWS, RESOLUTION = 50, 64
 FEWEST_VIEWS = 2
 MOST_VIEWS, MOST_SAMPLES, MOST_BYTES = 10_000, 16_384, 4 * 2**30  # an object; along a side; of all its pictures
 EXTRA_CHANNELS = {"depth": 4, "normals": 12, "coordinates": 12, "mesh": 0}  # bytes a pixel
-
-
-@dataclass(frozen=True)
-class RenderConfig:
-    """What decides the pictures of an object: a `GenerationConfig` in which nothing is left open.
-
-    Attributes:
-        rig: a name in `data_gen.rigs.RIGS`.
-        views: cameras an object.
-        resolution: pixels along a side.
-        distance: of the cameras from the origin, in world units; None for what suits the layout's loaders, which may
-            differ between classes.
-        field_of_view: in degrees; None fits the unit sphere.
-        lighting: a name in `data_gen.rendering.lighting.LIGHTING_PRESETS`.
-        channels: "rgba", and further ones in alphabetical order.
-        layout: a name in `data_gen.datasets.layouts.LAYOUTS`.
-        seed: of random rigs and lights.
-        supersample: samples along a side of a pixel.
-        renderer: a name in `data_gen.rendering.renderers.RENDERERS`.
-    """
-
-    rig: str
-    views: int
-    resolution: int
-    distance: float | None
-    field_of_view: float | None
-    lighting: str
-    channels: tuple[str, ...]
-    layout: str
-    seed: int
-    supersample: int
-    renderer: str
-
-    def make_rig(self, name: str, class_name: str | None = None) -> Rig:
-        """The cameras of an object.
-
-        Args:
-            name: of the object, on which random rigs depend.
-            class_name: of the object, on which the distance may depend.
-
-        Returns:
-            The rig.
-        """
-        distance = LAYOUTS[self.layout].distance(class_name) if self.distance is None else self.distance
-        lens = {"distance": distance, "field_of_view": self.field_of_view}
-        return make_rig(self.rig, self.views, self.resolution, seed=self.seed_for("rig", name), **lens)
-
-    def check_class(self, class_name: str | None) -> None:
-        """Refuse a class that the layout's loaders do not know, or of which they would not see all.
-
-        Args:
-            class_name: of objects, None where it is not known.
-
-        Raises:
-            ValueError: the class or the distance is none for this layout.
-        """
-        layout, rig = LAYOUTS[self.layout], self.make_rig("", class_name)
-        if layout.classes is not None and class_name not in layout.classes:
-            raise ValueError(
-                f"class: expected {', '.join(layout.classes)}, which the loaders of the {self.layout} layout know, got "
-                f"{class_name or 'meshes without a class; give --class-name'}"
-            )
-        planes = layout.near_far(class_name)
-        if planes is not None and (rig.near < planes[0] - 1e-9 or rig.far > planes[1] + 1e-9):
-            low, high = planes[0] + OBJECT_RADIUS, planes[1] - OBJECT_RADIUS
-            raise ValueError(
-                f"distance: expected {low:g} to {high:g} in the {self.layout} layout, whose loaders look from "
-                f"{planes[0]:g} to {planes[1]:g} radii for {class_name or 'any class'}, got {self.distance:g}"
-            )
-
-    def seed_for(self, purpose: str, name: str) -> int:
-        """A 32-bit seed for one purpose and one object."""
-        return seed_of(self.seed, purpose, name) % 2**32
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields as JSON has them."""
-        return {**asdict(self), "channels": list(self.channels)}
-
-    @classmethod
-    def from_json(cls, fields: dict[str, Any]) -> RenderConfig:
-        """The inverse of `as_json`."""
-        return cls(**{**fields, "channels": tuple(fields["channels"])})
+_UNSEEN = {"held_out", "workers", "engine", "timeout", "recycle"}  # fields that no picture depends on
 
 
 @dataclass(frozen=True)
@@ -149,11 +68,12 @@ class GenerationConfig:
     timeout: float = 300.0
     recycle: int = 200
 
-    def resolve(self) -> RenderConfig:
+    def resolve(self) -> GenerationConfig:
         """Check everything, and settle what was left open: by the layout, else by the preset, else by default.
 
         Returns:
-            What workers need to know.
+            What decides the pictures has a value, but for the field of view, None where the object just fits, and the
+            distance, None where it is what suits the layout's loaders and may differ between classes.
 
         Raises:
             ValueError: if a name is unknown, a number makes no sense, or no renderer works.
@@ -180,30 +100,81 @@ class GenerationConfig:
             distance = preset.distance if preset else DEFAULT_DISTANCE
         if field_of_view is None and preset:
             field_of_view = preset.field_of_view
-        views = self.views
+        views = self.views if self.views is not None else preset.views if preset else VIEWS
         resolution = layout.resolution if self.resolution is None else self.resolution
-        config = RenderConfig(
-            rig=self.rig,
-            views=(preset.views if preset else VIEWS) if views is None else views,
-            resolution=(preset.resolution if preset else RESOLUTION) if resolution is None else resolution,
-            distance=None if distance is None else float(distance),
-            field_of_view=layout.field_of_view or field_of_view,
-            lighting=self.lighting,
-            channels=("rgba", *sorted(set(self.channels) - {"rgba"})),
-            layout=self.layout,
-            seed=self.seed,
-            supersample=self.supersample,
-            renderer="",
-        )
+        if resolution is None:
+            resolution = preset.resolution if preset else RESOLUTION
+        channels = ("rgba", *sorted(set(self.channels) - {"rgba"}))
         if not 0 < self.timeout < math.inf:
             raise ValueError(f"timeout: expected seconds above 0, got {self.timeout:g}")
         if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers: expected at least 1, got {self.workers}")
         if self.engine == "ray" and find_spec("ray") is None:
             raise ValueError("engine: expected ray to be installed, found no such module; pip install ray")
-        _check_sizes(config)
+        _check_sizes(views, resolution, self.supersample, channels)
+        config = replace(
+            self,
+            views=views,
+            resolution=resolution,
+            distance=None if distance is None else float(distance),
+            field_of_view=layout.field_of_view or field_of_view,
+            channels=channels,
+        )
         config.make_rig("")  # numbers that make no sense show here, not in every worker
         return replace(config, renderer=find_renderer(self.renderer).name)
+
+    def make_rig(self, name: str, class_name: str | None = None) -> Rig:
+        """The cameras of an object, as a resolved configuration has them.
+
+        Args:
+            name: of the object, on which random rigs depend.
+            class_name: of the object, on which the distance may depend.
+
+        Returns:
+            The rig.
+        """
+        assert self.views is not None
+        assert self.resolution is not None
+        distance = LAYOUTS[self.layout].distance(class_name) if self.distance is None else self.distance
+        lens = {"distance": distance, "field_of_view": self.field_of_view}
+        return make_rig(self.rig, self.views, self.resolution, seed=self.seed_for("rig", name), **lens)
+
+    def check_class(self, class_name: str | None) -> None:
+        """Refuse a class that the layout's loaders do not know, or of which they would not see all.
+
+        Args:
+            class_name: of objects, None where it is not known.
+
+        Raises:
+            ValueError: the class or the distance is none for this layout.
+        """
+        layout, rig = LAYOUTS[self.layout], self.make_rig("", class_name)
+        if layout.classes is not None and class_name not in layout.classes:
+            raise ValueError(
+                f"class: expected {', '.join(layout.classes)}, which the loaders of the {self.layout} layout know, got "
+                f"{class_name or 'meshes without a class; give --class-name'}"
+            )
+        planes = layout.near_far(class_name)
+        if planes is not None and (rig.near < planes[0] - 1e-9 or rig.far > planes[1] + 1e-9):
+            low, high = planes[0] + OBJECT_RADIUS, planes[1] - OBJECT_RADIUS
+            raise ValueError(
+                f"distance: expected {low:g} to {high:g} in the {self.layout} layout, whose loaders look from "
+                f"{planes[0]:g} to {planes[1]:g} radii for {class_name or 'any class'}, got {self.distance:g}"
+            )
+
+    def seed_for(self, purpose: str, name: str) -> int:
+        """A 32-bit seed for one purpose and one object."""
+        return seed_of(self.seed, purpose, name) % 2**32
+
+    def as_json(self) -> dict[str, Any]:
+        """What decides the pictures of an object, as JSON has it."""
+        fields = asdict(self) | {"channels": list(self.channels)}
+        return {name: value for name, value in fields.items() if name not in _UNSEEN}
+
+    @classmethod
+    def from_json(cls, fields: dict[str, Any]) -> GenerationConfig:
+        """The inverse of `as_json`."""
+        return cls(**{**fields, "channels": tuple(fields["channels"])})
 
     def _check_names(self) -> None:
         from data_gen.rendering.lighting import LIGHTING_PRESETS
@@ -220,9 +191,8 @@ class GenerationConfig:
             raise ValueError(f"channels: expected rgba alone in the {self.layout} layout, got {channels}")
 
 
-def _check_sizes(config: RenderConfig) -> None:
+def _check_sizes(views: int, resolution: int, supersample: int, channels: Sequence[str]) -> None:
     """Sizes are checked before anything is allocated; the pictures of one object are in memory at once."""
-    views, resolution, supersample = config.views, config.resolution, config.supersample
     if not FEWEST_VIEWS <= views <= MOST_VIEWS:
         wanted = f"{FEWEST_VIEWS} (support and query) to {MOST_VIEWS:,} an object"
         raise ValueError(f"views: expected {wanted}, got {views:,}")
@@ -231,7 +201,7 @@ def _check_sizes(config: RenderConfig) -> None:
             f"resolution: expected at most {MOST_SAMPLES:,} samples along a side, got {resolution:,} pixels of "
             f"{supersample} each"
         )
-    needed = views * resolution**2 * (4 + sum(EXTRA_CHANNELS.get(channel, 0) for channel in config.channels))
+    needed = views * resolution**2 * (4 + sum(EXTRA_CHANNELS.get(channel, 0) for channel in channels))
     if needed > MOST_BYTES:
         raise ValueError(
             f"resolution: expected at most {MOST_BYTES >> 30} GiB of pictures an object, got {needed / 2**30:,.1f} GiB "

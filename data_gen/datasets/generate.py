@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from data_gen.datasets.config import GenerationConfig, RenderConfig
+from data_gen.datasets.config import GenerationConfig
 from data_gen.datasets.layouts import LAYOUTS, check_names
 from data_gen.datasets.manifest import Entry, GenerationState, build_manifest, holds_data_set
 from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
@@ -165,7 +165,7 @@ def generate(
 
 
 def _configuration(
-    source: Source, items: list[Item], render: RenderConfig, held_out: float | int | None
+    source: Source, items: list[Item], render: GenerationConfig, held_out: float | int | None
 ) -> dict[str, Any]:
     """What decides the bytes, without a path of this machine."""
     if isinstance(source, Procedural):
@@ -203,7 +203,7 @@ def _without_path(reason: str, source: Source) -> str:
     return reason
 
 
-def _facts(render: RenderConfig, classes: list[str | None]) -> dict[str, Any]:
+def _facts(render: GenerationConfig, classes: list[str | None]) -> dict[str, Any]:
     """What readers of the data set want to know of all its objects."""
     scale, rigs = LAYOUTS[render.layout].scale, [render.make_rig("", name) for name in classes]
     return {

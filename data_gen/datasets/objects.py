@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from data_gen.datasets.config import RenderConfig
+from data_gen.datasets.config import GenerationConfig
 from data_gen.datasets.layouts import LAYOUTS, RenderedObject
 from data_gen.datasets.sources import Item
 from hyperplanes.utilities.encoding import encode_json, sha256
@@ -22,15 +22,15 @@ def open_renderer(settings: dict[str, Any]) -> Generator[Callable[[dict[str, Any
     """A function from an `Item`'s fields to the record of the object it wrote; one renderer serves all calls.
 
     Args:
-        settings: `out`, the folder of the data set, `render`, a `RenderConfig` as JSON, and `meshes`, the folder that
-            no mesh may read outside of, or None.
+        settings: `out`, the folder of the data set, `render`, a resolved `GenerationConfig` as JSON, and `meshes`, the
+            folder that no mesh may read outside of, or None.
 
     Yields:
         The function. It raises ValueError, with the reason, for an object that cannot be drawn.
     """
     from data_gen.rendering.mesh_renderer import MeshRenderer
 
-    config, out = RenderConfig.from_json(settings["render"]), Path(settings["out"])
+    config, out = GenerationConfig.from_json(settings["render"]), Path(settings["out"])
     meshes = None if settings["meshes"] is None else Path(settings["meshes"])
     with MeshRenderer(config.renderer, config.supersample) as renderer:
 
@@ -41,7 +41,7 @@ def open_renderer(settings: dict[str, Any]) -> Generator[Callable[[dict[str, Any
         yield process
 
 
-def _render(renderer: Any, item: Item, config: RenderConfig, meshes: Path | None) -> RenderedObject:
+def _render(renderer: Any, item: Item, config: GenerationConfig, meshes: Path | None) -> RenderedObject:
     from data_gen.meshes.gltf import write_glb
     from data_gen.meshes.mesh import load_mesh, mesh_parts, prepare_scene
 
