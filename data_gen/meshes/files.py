@@ -59,7 +59,7 @@ class MeshError(ValueError):
     """A mesh that is refused. The message is one line: file, expected, found, remedy."""
 
 
-def read_bytes(path: Path, *, limit: int = MAX_FILE_BYTES) -> bytes:
+def read_bytes(path: Path, *, limit: int) -> bytes:
     """Read a file whose size is checked first.
 
     Args:
@@ -85,7 +85,7 @@ def read_bytes(path: Path, *, limit: int = MAX_FILE_BYTES) -> bytes:
         raise MeshError(f"{path}: expected a readable file, found {error.strerror or error}") from error
 
 
-def check_image(data: bytes, name: str, *, limit: int = MAX_PIXELS) -> int:
+def check_image(data: bytes, name: str, *, limit: int) -> int:
     """Decode an image, after its size was checked, to see that it is whole.
 
     Args:

@@ -87,7 +87,6 @@ class ModelFolder(Resolver):
     Args:
         path: the mesh file; its name is what messages begin with.
         within: the folder that nothing may leave; `model_root(path)` by default, and where the file is not in it.
-        pixels: pixels that all textures together may have.
 
     A file that is not there, and a texture that cannot be decoded, is a FileNotFoundError and noted in `lost`.
 
@@ -97,13 +96,13 @@ class ModelFolder(Resolver):
         refused: the first reason to refuse the whole model, if there was one: loaders swallow exceptions.
     """
 
-    def __init__(self, path: Path, within: Path | None = None, *, pixels: int = MAX_PIXELS) -> None:
+    def __init__(self, path: Path, within: Path | None = None) -> None:
         self.path = path
         self.folder = path.parent.resolve()
         self.root = model_root(path) if within is None else within.resolve()
         if not self.folder.is_relative_to(self.root):
             self.root = model_root(path)
-        self.pixels_left = pixels
+        self.pixels_left = MAX_PIXELS
         self.lost: dict[str, str] = {}
         self.notes: list[str] = []
         self.refused: MeshError | None = None

@@ -30,10 +30,9 @@ from mesh_writers import (
     write_obj,
 )
 
-from data_gen.meshes import files
+from data_gen.meshes import files, model_folder
 from data_gen.meshes.materials import LINEAR_COLOUR
 from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts, prepare_scene
-from data_gen.meshes.model_folder import ModelFolder
 from data_gen.rendering.mesh_renderer import MeshRenderer
 from data_gen.rigs import fixed
 
@@ -736,7 +735,7 @@ def test_many_textures_count_together(tmp_path, monkeypatch):
         (tmp_path / f"{index}.png").write_bytes(picture(size=(10, 10)))
     path = write_obj(tmp_path, mtl=mtl, body=body)
     assert len(mesh_parts(load_mesh(path))) == 3
-    monkeypatch.setattr(ModelFolder.__init__, "__kwdefaults__", {"pixels": 250})
+    monkeypatch.setattr(model_folder, "MAX_PIXELS", 250)
     assert "2.png: expected textures of at most 50 pixels" in refusal(path)
 
 
