@@ -154,9 +154,7 @@ def _drawn(
     assert rgba is not None
     alpha = rgba[..., 3:].astype(np.float32) / 255
     premultiplied = np.concatenate([(rgba[..., :3] * alpha).round().astype(np.uint8), rgba[..., 3:]], -1)
-    lowest = min(
-        float((part.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 1].min()) for part, pose, _ in mesh_parts(mesh)
-    )
+    lowest = min(float(part.vertices[:, 1].min()) for part in mesh_parts(mesh))
     return premultiplied, lowest
 
 

@@ -184,21 +184,9 @@ def prepare_scene(
     )
 
 
-def mesh_parts(mesh: Mesh) -> list[tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]]:
-    """The parts of a mesh as `MeshRenderer.render` takes them.
-
-    Args:
-        mesh: the mesh.
-
-    Returns:
-        Each geometry, its pose `world_from_geometry` `(4, 4)`, and whether to shade it smoothly.
-    """
-    ready = []
-    for node in sorted(mesh.scene.graph.nodes_geometry):
-        pose, key = mesh.scene.graph[node]
-        geometry = mesh.scene.geometry[key]
-        ready.append((geometry, np.asarray(pose), bool(geometry.metadata.get("smooth", True))))
-    return ready
+def mesh_parts(mesh: Mesh) -> list[trimesh.Trimesh]:
+    """The parts of a mesh as `MeshRenderer.render` takes them: its geometries, by name."""
+    return [mesh.scene.geometry[name] for name in sorted(mesh.scene.geometry)]
 
 
 def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:

@@ -22,10 +22,7 @@ from data_gen.rendering.renderers import REMEDIES, RENDERERS, RendererError, Ren
 from data_gen.rendering.surfaces import RenderError, ShadedSurface, shaded_surfaces
 from data_gen.rigs import Rig
 
-__all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "PlacedMesh", "RenderError", "Rendering", "ViewRenderer"]
-
-PlacedMesh = tuple[trimesh.Trimesh, npt.NDArray[np.float64], bool]
-"""A mesh, its pose world_from_mesh (4, 4), and whether it is shaded smoothly."""
+__all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "RenderError", "Rendering", "ViewRenderer"]
 
 CHANNELS = ("rgba", "depth", "normals", "coordinates", "mask")
 """What render can return."""
@@ -114,7 +111,7 @@ class MeshRenderer:
 
     def render(
         self,
-        parts: Sequence[PlacedMesh],
+        parts: Sequence[trimesh.Trimesh],
         rig: Rig,
         *,
         lighting: str | Lighting = "studio",
@@ -125,7 +122,7 @@ class MeshRenderer:
         """Draw an object from every camera of a rig.
 
         Args:
-            parts: meshes with their poses and whether they are smooth.
+            parts: meshes in world coordinates, as `shaded_surfaces` takes them.
             rig: the cameras.
             lighting: name of a preset or a Lighting.
             channels: what to return, of CHANNELS.

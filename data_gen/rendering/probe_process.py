@@ -36,7 +36,7 @@ def draw_test_image(name: str) -> str:
     intrinsics = np.array([[16.0, 0.0, 7.5], [0.0, 16.0, 7.5], [0.0, 0.0, 1.0]])
     rig = Rig(look_at_origin([[0.0, 0.0, 2.0]]), intrinsics, 16, 16, 1.0, 3.0)
     with MeshRenderer(name) as renderer:
-        drawn = renderer.render([(sheet, np.eye(4), False)], rig)
+        drawn = renderer.render([sheet], rig)
         picture = np.asarray(drawn.rgba)[0].astype(int)
         detail = renderer.detail
     left, right = picture[:, :8], picture[:, 8:]

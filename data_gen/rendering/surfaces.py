@@ -120,30 +120,27 @@ class ShadedSurface:
     culled: bool = False
 
 
-def shaded_surfaces(parts: Sequence[tuple[trimesh.Trimesh, Any, bool]], name: str = "object") -> list[ShadedSurface]:
+def shaded_surfaces(parts: Sequence[trimesh.Trimesh], name: str = "object") -> list[ShadedSurface]:
     """Bring the parts of an object into the form that the renderers draw.
 
     Args:
-        parts: meshes, their poses `world_from_mesh` `(4, 4)` (any affine map, mirroring included) and whether each
-            is shaded smoothly. Face colours are drawn flat in any case. A mesh whose `metadata["closed"]` is true
-            is taken for closed; the inner sides of one whose `metadata["one_sided"]` is true hide nothing.
+        parts: meshes in world coordinates. One whose `metadata["smooth"]` is true, or not there, is shaded smoothly,
+            but face colours are drawn flat in any case. One whose `metadata["closed"]` is true is taken for closed;
+            the inner sides of one whose `metadata["one_sided"]` is true hide nothing.
         name: what to call the object in errors.
 
     Returns:
         One surface a part, in order; parts without faces are left out.
 
     Raises:
-        RenderError: if a part is no Trimesh, a pose is no finite affine map, a face's vertex is not finite, a
-            texture has no coordinates, a material is of an unknown kind, or no part has a face.
+        RenderError: if a face's vertex is not finite, a texture has no coordinates, a material is of an unknown kind,
+            or no part has a face.
     """
     images: dict[Any, npt.NDArray[np.uint8]] = {}
     surfaces = []
-    for number, (mesh, pose, smooth) in enumerate(parts):
-        where = f"{name}, part {number}"
-        if not isinstance(mesh, trimesh.Trimesh):
-            raise RenderError(f"{where}: expected a trimesh.Trimesh, received {type(mesh).__name__}")
+    for number, mesh in enumerate(parts):
         if len(mesh.faces):
-            surfaces.append(_surface(mesh, pose, smooth, where, images))
+            surfaces.append(_surface(mesh, f"{name}, part {number}", images))
     if not surfaces:
         raise RenderError(f"{name}: expected at least one face, received {len(parts)} parts without any")
     return _one_side_where_doubled(surfaces)
@@ -185,19 +182,14 @@ def _identified(
     return a + b + c, rising == 2
 
 
-def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images: dict[Any, Any]) -> ShadedSurface:
-    matrix = np.asarray(pose, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], (0, 0, 0, 1)):
-        raise RenderError(f"{where}: expected a finite affine pose (4, 4), received {matrix.tolist()}")
+def _surface(mesh: trimesh.Trimesh, where: str, images: dict[Any, Any]) -> ShadedSurface:
     faces = np.asarray(mesh.faces, dtype=np.int64)
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(vertices).all(axis=1))
     if not finite[faces].all():
         bad = int((~finite[faces]).any(axis=1).sum())
         raise RenderError(f"{where}: expected finite vertices, received {bad} faces on NaN or infinity")
-    positions = np.where(finite[:, None], vertices, 0.0) @ matrix[:3, :3].T + matrix[:3, 3]
-    if np.linalg.det(matrix[:3, :3]) < 0:
-        faces = faces[:, ::-1]
+    positions = np.where(finite[:, None], vertices, 0.0)
     visual, texture = visual_of(mesh), texture_of(mesh)
     kind = visual.kind if visual.defined else None
     material = _material(None if texture is None else texture.material, images, where)
@@ -207,8 +199,8 @@ def _surface(mesh: trimesh.Trimesh, pose: Any, smooth: bool, where: str, images:
         colours = linear_colours(visual.vertex_colors)
     elif texture is not None and LINEAR_COLOUR in texture.vertex_attributes:
         colours = np.asarray(texture.vertex_attributes[LINEAR_COLOUR], dtype=np.float64)
-    if smooth and kind != "face":
-        normals = _unit(np.asarray(mesh.vertex_normals, dtype=np.float64) @ np.linalg.pinv(matrix[:3, :3]))
+    if mesh.metadata.get("smooth", True) and kind != "face":
+        normals = _unit(np.asarray(mesh.vertex_normals, dtype=np.float64))
     else:
         corners = faces.reshape(-1)
         positions = positions[corners]

@@ -28,7 +28,7 @@ def test_what_glows_is_as_bright_as_what_is_lit(tmp_path):
     # 0.5 in sRGB is 0.214 of linear light, whether a surface reflects or emits it
     glow = "<emission><color>0.5 0 1 1</color></emission><diffuse>"
     text = dae_text(diffuse="<color>0.5 0 1 1</color>").replace("<diffuse>", glow)
-    ((part, _, _),) = mesh_parts(load_mesh(written(tmp_path, text)))
+    (part,) = mesh_parts(load_mesh(written(tmp_path, text)))
     np.testing.assert_allclose(part.visual.material.emissiveFactor, [0.21404, 0, 1], atol=1e-5)
     np.testing.assert_allclose(linear_factor(part.visual.material)[:3], [0.21404, 0, 1], atol=0.003)
 

@@ -190,7 +190,7 @@ def test_other_programs_draw_the_exported_mesh_alike(tmp_path):
     assert accessor["componentType"] == 5126
     view = tree["bufferViews"][accessor["bufferView"]]
     found = np.frombuffer(buffer, np.float32, 4 * accessor["count"], view["byteOffset"]).reshape(-1, 4)
-    seen = mesh_parts(ball)[0][0].visual.vertex_colors[:, :3] / 255
+    seen = mesh_parts(ball)[0].visual.vertex_colors[:, :3] / 255
     np.testing.assert_allclose(found[:, :3], linear_from_srgb(seen), atol=1e-6)
 
 
@@ -202,8 +202,8 @@ def header_and_buffer(data):
 def test_vertex_colours_in_files_of_trimesh_are_srgb(tmp_path):
     ball = painted_ball("vertices")
     ball.scene.export(tmp_path / "a.glb")
-    found = mesh_parts(load_mesh(tmp_path / "a.glb"))[0][0].visual.vertex_colors
-    assert np.array_equal(found, mesh_parts(ball)[0][0].visual.vertex_colors)
+    found = mesh_parts(load_mesh(tmp_path / "a.glb"))[0].visual.vertex_colors
+    assert np.array_equal(found, mesh_parts(ball)[0].visual.vertex_colors)
 
 
 def test_vertex_colours_multiply_the_texture(tmp_path, backend):
@@ -232,7 +232,7 @@ def test_a_material_of_the_older_workflow_with_a_palette_has_the_colours_of_the_
         header["materials"] = [{"extensions": {"KHR_materials_pbrSpecularGlossiness": glossy}}]
 
     mesh = sheet(tmp_path / "a.glb", image=stream.getvalue(), change=change)
-    ((part, _, _),) = mesh_parts(mesh)
+    (part,) = mesh_parts(mesh)
     texels = np.asarray(part.visual.material.baseColorTexture)
     expected = np.asarray(PIL.Image.open(io.BytesIO(quarters())))
     assert np.abs(texels.astype(int) - expected).max() <= 12  # a diffuse colour is scaled by 1 / 0.96 on the way
@@ -241,7 +241,7 @@ def test_a_material_of_the_older_workflow_with_a_palette_has_the_colours_of_the_
 @pytest.mark.parametrize(("mode", "corners"), [(5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])
 def test_strips_and_fans_are_the_same_two_triangles(tmp_path, mode, corners):
     mesh = load_mesh(write_glb(tmp_path / "a.glb", positions=SHEET, faces=corners, mode=mode))
-    ((part, _, _),) = mesh_parts(mesh)
+    (part,) = mesh_parts(mesh)
     assert mesh.face_count == 2
     assert part.area == pytest.approx(2.0)  # of a square whose corners are at distance 1
     assert np.allclose(part.face_normals, [0, 0, 1])
@@ -260,7 +260,7 @@ def add(header, buffer, array, kind, component, **more):
 
 def points_in_file(mesh):
     """Vertices of a mesh in the coordinates of its file."""
-    world = np.concatenate([part.vertices for part, _, _ in mesh_parts(mesh)])
+    world = np.concatenate([part.vertices for part in mesh_parts(mesh)])
     return (world - mesh.world_from_file[:3, 3]) @ np.linalg.inv(mesh.world_from_file[:3, :3]).T
 
 
@@ -364,7 +364,7 @@ def test_transmission_is_drawn_as_opacity_with_a_warning(tmp_path, factor, metal
         "extensions": {"KHR_materials_transmission": {"transmissionFactor": factor}},
     }
     mesh = load_mesh(write_glb(tmp_path / "a.glb", material=material))
-    alpha = np.asarray(mesh_parts(mesh)[0][0].visual.material.baseColorFactor)[3] / 255
+    alpha = np.asarray(mesh_parts(mesh)[0].visual.material.baseColorFactor)[3] / 255
     assert alpha == pytest.approx(opacity, abs=1 / 255)
     assert any("KHR_materials_transmission drawn as opacity 0.70" in said for said in mesh.warnings) == (opacity < 1)
 

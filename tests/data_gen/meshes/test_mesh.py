@@ -54,7 +54,7 @@ def write_any(folder, kind):
 
 def corners(mesh):
     """Corners of all faces in the world, in the order of the file."""
-    return np.concatenate([part.vertices[part.faces] for part, _, _ in mesh_parts(mesh)])
+    return np.concatenate([part.vertices[part.faces] for part in mesh_parts(mesh)])
 
 
 def colour(part):
@@ -108,10 +108,10 @@ def test_z_up_is_turned_to_y_up(tmp_path):
 def test_node_transforms_and_instances_are_baked(tmp_path):
     nodes = [{"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0], "scale": [2, 2, 2]}]
     mesh = load_mesh(write_glb(tmp_path / "a.glb", nodes=nodes))
-    parts = sorted(mesh_parts(mesh), key=lambda part: part[0].scale)
-    assert [len(part.faces) for part, _, _ in parts] == [4, 4]
-    assert all(np.array_equal(pose, np.eye(4)) for _, pose, _ in parts)
-    in_file = trimesh.transform_points(parts[1][0].vertices, np.linalg.inv(mesh.world_from_file))
+    parts = sorted(mesh_parts(mesh), key=lambda part: part.scale)
+    assert [len(part.faces) for part in parts] == [4, 4]
+    assert all(np.array_equal(mesh.scene.graph[node][0], np.eye(4)) for node in mesh.scene.graph.nodes_geometry)
+    in_file = trimesh.transform_points(parts[1].vertices, np.linalg.inv(mesh.world_from_file))
     assert np.allclose(in_file, TETRAHEDRON * 2 + [3, 0, 0], atol=1e-5)
 
 
@@ -121,19 +121,19 @@ def test_normals_follow_a_stretching_transform(tmp_path):
     normal = np.array([[np.sqrt(0.5), np.sqrt(0.5), 0]] * 4)
     nodes = [{"mesh": 0, "scale": [4, 1, 1]}]
     path = write_glb(tmp_path / "a.glb", positions=points, faces=[[0, 1, 2], [0, 2, 3]], normals=normal, nodes=nodes)
-    part, _, smooth = mesh_parts(load_mesh(path))[0]
-    assert smooth
+    part = mesh_parts(load_mesh(path))[0]
+    assert part.metadata["smooth"]
     assert np.allclose(part.vertex_normals, np.array([0.25, 1, 0]) / np.hypot(0.25, 1), atol=1e-6)
 
 
 def test_obj_colours_are_made_linear_and_a_texture_takes_their_place(tmp_path):
     # sRGB 188 / 255 is linear 128 / 255.
     # sRGB 0.1 is linear ((0.1 + 0.055) / 1.055)^2.4, which 8 bits would round to 3 / 255.
-    plain = mesh_parts(load_mesh(write_obj(tmp_path, mtl="newmtl paint\nKd 0.737255 0 0.1\n")))[0][0]
+    plain = mesh_parts(load_mesh(write_obj(tmp_path, mtl="newmtl paint\nKd 0.737255 0 0.1\n")))[0]
     assert colour(plain) == [128, 0, 3, 255]
     assert plain.copy().visual.material.exact[2] == pytest.approx(((0.1 + 0.055) / 1.055) ** 2.4, abs=1e-9)
     path = write_obj(tmp_path, mtl="newmtl paint\nKd 0 0 0\nmap_Kd wood.png\n", texture=picture(colour=(9, 8, 7)))
-    part = mesh_parts(load_mesh(path))[0][0]
+    part = mesh_parts(load_mesh(path))[0]
     assert colour(part) == [255] * 4
     assert part.visual.material.baseColorTexture.getpixel((0, 0)) == (9, 8, 7)
     assert np.allclose(part.visual.uv[part.faces[3]], [[1, 0], [0, 1], [1, 1]])
@@ -149,7 +149,7 @@ def test_obj_polygons_relative_indices_tabs_and_several_libraries(tmp_path):
     )
     mesh = load_mesh(write_obj(tmp_path, body=body))
     assert mesh.warnings == ()
-    (red, _, _), (blue, _, _) = mesh_parts(mesh)
+    red, blue = mesh_parts(mesh)
     assert (len(red.faces), len(blue.faces)) == (2, 3)
     assert colour(red) == [255, 0, 0, 255]
     assert colour(blue) == [0, 0, 255, 128]
@@ -157,14 +157,14 @@ def test_obj_polygons_relative_indices_tabs_and_several_libraries(tmp_path):
 
 def test_obj_smoothing_groups_count_where_there_are_no_normals(tmp_path):
     solid = OBJ_SOLID + "{}\n" + OBJ_FACES
-    smooth = [mesh_parts(load_mesh(write_obj(tmp_path, body=solid.format(line))))[0][2] for line in ("s 1", "s off")]
-    assert smooth == [True, False]
+    parts = [mesh_parts(load_mesh(write_obj(tmp_path, body=solid.format(line))))[0] for line in ("s 1", "s off")]
+    assert [part.metadata["smooth"] for part in parts] == [True, False]
 
 
 def test_without_normals_round_things_are_smooth_and_hard_things_flat():
     shapes = {"ball": trimesh.creation.icosphere(subdivisions=3), "box": trimesh.creation.box()}
-    smooth = {name: mesh_parts(prepare_scene(trimesh.Scene(shape), name))[0][2] for name, shape in shapes.items()}
-    assert smooth == {"ball": True, "box": False}
+    parts = {name: mesh_parts(prepare_scene(trimesh.Scene(shape), name))[0] for name, shape in shapes.items()}
+    assert {name: part.metadata["smooth"] for name, part in parts.items()} == {"ball": True, "box": False}
 
 
 def test_vertex_colours_stay_srgb(tmp_path):
@@ -172,10 +172,10 @@ def test_vertex_colours_stay_srgb(tmp_path):
     (tmp_path / "a.ply").write_bytes(ply_bytes(colours=seen))
     (tmp_path / "a.off").write_text(off_text(head="COFF", vertex_tail=" 0.5 0 1 1"))
     ply, off = (mesh_parts(load_mesh(tmp_path / name))[0] for name in ("a.ply", "a.off"))
-    assert np.array_equal(ply[0].visual.vertex_colors, seen)
-    assert np.array_equal(off[0].visual.vertex_colors, [[128, 0, 255, 255]] * 4)
+    assert np.array_equal(ply.visual.vertex_colors, seen)
+    assert np.array_equal(off.visual.vertex_colors, [[128, 0, 255, 255]] * 4)
     obj = write_obj(tmp_path, body="v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 0 0 1\nf 1 2 3\n")
-    part = mesh_parts(load_mesh(obj))[0][0]
+    part = mesh_parts(load_mesh(obj))[0]
     assert np.array_equal(part.visual.vertex_colors[:, :3], [[255, 0, 0], [255, 0, 0], [0, 0, 255]])
 
 
@@ -184,7 +184,7 @@ def test_gltf_vertex_colours_are_linear_and_tinted_by_the_material(tmp_path):
     painted = np.array([[0.50196, 0.50196, 1, 1]] * 4)
     material = {"pbrMetallicRoughness": {"baseColorFactor": [0.0018, 0, 1, 1], "roughnessFactor": 0.25}}
     mesh = load_mesh(write_glb(tmp_path / "a.glb", colours=painted, material=material))
-    part = mesh_parts(mesh)[0][0]
+    part = mesh_parts(mesh)[0]
     assert mesh.warnings == ()
     np.testing.assert_allclose(part.visual.vertex_attributes[LINEAR_COLOUR], painted, atol=0.002)
     np.testing.assert_allclose(linear_factor(part.visual.material), [0.0018, 0, 1, 1])
@@ -196,7 +196,7 @@ def test_gltf_vertex_colours_without_a_material_are_opaque_in_every_type_of_numb
     # the alpha of an opaque material is ignored (glTF 2.0, 3.9.4)
     top = 1.0 if kind == np.float32 else np.iinfo(kind).max
     painted = (np.array([[0.50196, 0, 1, 0.5]] * 4) * top + 0.5 * (top > 1)).astype(kind)
-    part = mesh_parts(load_mesh(write_glb(tmp_path / "a.glb", colours=painted)))[0][0]
+    part = mesh_parts(load_mesh(write_glb(tmp_path / "a.glb", colours=painted)))[0]
     found = part.visual.vertex_attributes[LINEAR_COLOUR]
     np.testing.assert_allclose(found, [[0.50196, 0, 1, 1]] * 4, atol=0.6 / 65535)
 
@@ -220,7 +220,7 @@ def test_the_alpha_of_gltf_vertex_colours_counts_where_the_material_cuts_by_it(t
     for cutoff in (0.5, 0.7):
         material = {"alphaMode": "MASK", "alphaCutoff": cutoff}
         mesh = load_mesh(write_glb(tmp_path / "a.glb", colours=painted, material=material))
-        visual = mesh_parts(mesh)[0][0].visual
+        visual = mesh_parts(mesh)[0].visual
         assert (visual.material.alphaMode, visual.material.alphaCutoff) == ("MASK", cutoff)
         np.testing.assert_allclose(visual.vertex_attributes[LINEAR_COLOUR][:, 3], 0.6, atol=0.002)
 
@@ -230,7 +230,7 @@ def test_gltf_without_normals_is_flat(tmp_path):
     ball = trimesh.creation.icosphere(3)
     for normals, smooth in ((None, False), (ball.vertex_normals, True)):
         path = write_glb(tmp_path / "a.glb", positions=ball.vertices, faces=ball.faces, normals=normals)
-        assert mesh_parts(load_mesh(path))[0][2] == smooth
+        assert mesh_parts(load_mesh(path))[0].metadata["smooth"] == smooth
 
 
 def test_the_vertex_colours_of_an_obj_have_one_range(tmp_path):
@@ -238,7 +238,7 @@ def test_the_vertex_colours_of_an_obj_have_one_range(tmp_path):
     points = [(0, 0, 0, 255, 0, 0), (1, 0, 0, 0, 200, 0), (0, 1, 0, 0, 0, 9), (0, 0, 1, 0, 0, 1), (1, 0, 1, 1, 0, 0)]
     body = "".join(f"v {' '.join(map(str, each))}\n" for each in [*points, (0, 1, 1, 0, 1, 0)])
     parts = mesh_parts(load_mesh(write_obj(tmp_path, body=body + "o a\nf 1 2 3\no b\nusemtl none\nf 4 5 6\n")))
-    assert {int(part.visual.vertex_colors[:, :3].max()) for part, _, _ in parts} == {255, 1}
+    assert {int(part.visual.vertex_colors[:, :3].max()) for part in parts} == {255, 1}
 
 
 def test_colours_of_ply_faces_are_kept(tmp_path):
@@ -247,8 +247,8 @@ def test_colours_of_ply_faces_are_kept(tmp_path):
     points = "".join(" ".join(str(float(value)) for value in point) + "\n" for point in TETRAHEDRON)
     faces = "".join(f"3 {a} {b} {c} {10 * a} {10 * b} {10 * c}\n" for a, b, c in TETRAHEDRON_FACES)
     (tmp_path / "a.ply").write_bytes(head + (points + faces).encode())
-    part, _, smooth = mesh_parts(load_mesh(tmp_path / "a.ply"))[0]
-    assert not smooth
+    part = mesh_parts(load_mesh(tmp_path / "a.ply"))[0]
+    assert not part.metadata["smooth"]
     assert np.array_equal(part.visual.face_colors[:, :3], 10 * TETRAHEDRON_FACES)
 
 
@@ -279,7 +279,7 @@ def test_colours_of_ply_files_have_the_range_of_their_type(tmp_path, element, bi
     (tmp_path / "a.ply").write_bytes(head.encode() + b"end_header\n" + body)
     mesh = load_mesh(tmp_path / "a.ply")
     assert mesh.warnings == ()
-    visual = mesh_parts(mesh)[0][0].visual
+    visual = mesh_parts(mesh)[0].visual
     assert np.array_equal(getattr(visual, f"{element}_colors"), [[128, 0, 255, 255]] * 4)
 
 
@@ -299,9 +299,7 @@ def test_a_prepared_scene_survives_its_own_export(tmp_path):
     again = load_mesh(tmp_path / "b.glb")
     assert again.warnings == ()
     assert np.allclose(again.world_from_file, np.eye(4), atol=1e-6)
-    before, after = (
-        sorted((part for part, _, _ in mesh_parts(each)), key=lambda part: part.scale) for each in (mesh, again)
-    )
+    before, after = (sorted(mesh_parts(each), key=lambda part: part.scale) for each in (mesh, again))
     for first, second in zip(before, after, strict=True):
         assert np.allclose(first.vertices[first.faces], second.vertices[second.faces], atol=1e-6)
 
@@ -309,8 +307,8 @@ def test_a_prepared_scene_survives_its_own_export(tmp_path):
 def test_face_colours_are_shaded_flat(tmp_path):
     tails = (" 255 0 0", " 0 255 0", " 0 0 255", " 9 9 9")
     (tmp_path / "a.off").write_text(off_text(face_tails=tails))
-    part, _, smooth = mesh_parts(load_mesh(tmp_path / "a.off"))[0]
-    assert not smooth
+    part = mesh_parts(load_mesh(tmp_path / "a.off"))[0]
+    assert not part.metadata["smooth"]
     assert np.array_equal(part.visual.face_colors[:, :3], [[255, 0, 0], [0, 255, 0], [0, 0, 255], [9, 9, 9]])
 
 
@@ -324,7 +322,7 @@ def test_gltf_materials_keep_their_factors_textures_and_alpha_mode(tmp_path):
     }
     image = picture("RGBA", colour=(1, 2, 3, 200))
     mesh = load_mesh(write_glb(tmp_path / "a.glb", uv=SQUARE_UV, material=material, image=image))
-    kept = mesh_parts(mesh)[0][0].visual.material
+    kept = mesh_parts(mesh)[0].visual.material
     assert mesh.warnings == ()
     assert (kept.alphaMode, kept.alphaCutoff, kept.doubleSided) == ("MASK", 0.25, True)
     assert (kept.metallicFactor, kept.roughnessFactor) == (0.25, 0.75)
@@ -339,7 +337,7 @@ def test_collada_turns_as_it_declares_and_finds_its_texture(tmp_path):
     assert mesh.warnings == ()
     assert np.allclose(mesh.world_from_file[:3, :3] @ [0, 0, 1] * RADIUS, [0, 1, 0])
     # Its 0.5 is sRGB 128, linear 55.
-    assert colour(mesh_parts(mesh)[0][0]) == [255, 55, 0, 255]
+    assert colour(mesh_parts(mesh)[0]) == [255, 55, 0, 255]
 
 
 def test_a_prepared_scene_leaves_the_given_one_alone():
@@ -351,7 +349,7 @@ def test_a_prepared_scene_leaves_the_given_one_alone():
     mesh = prepare_scene(scene, "box")
     assert np.allclose(box.extents, 4)
     assert np.allclose(mesh.scene.extents, 2 / np.sqrt(3))
-    assert colour(mesh_parts(mesh)[0][0]) == [10, 20, 30, 255]
+    assert colour(mesh_parts(mesh)[0]) == [10, 20, 30, 255]
     assert mesh.world_from_file[0, 0] == pytest.approx(1 / np.sqrt(12))
 
 
@@ -398,7 +396,7 @@ def test_all_real_meshes_load_with_their_losses_named():
             outcomes[file.name] = str(error)
             continue
         assert np.isclose(np.linalg.norm(corners(mesh), axis=-1).max(), 1.0)
-        for part, _, _ in mesh_parts(mesh):
+        for part in mesh_parts(mesh):
             assert isinstance(part.visual, trimesh.visual.ColorVisuals) or isinstance(
                 part.visual.material.baseColorTexture, PIL.Image.Image | None
             )

@@ -41,7 +41,7 @@ WOOD = PAINT + "map_Kd wood.png\n"
 
 
 def only_part(mesh):
-    ((part, _, _),) = mesh_parts(mesh)
+    (part,) = mesh_parts(mesh)
     return part
 
 
@@ -421,8 +421,8 @@ def test_the_size_of_a_mesh_changes_nothing_of_its_repair(scale):
     scene = trimesh.Scene([ball, rod])
     whole, scaled = prepare_scene(scene, "it"), prepare_scene(scene.scaled(scale), "it")
     assert scaled.warnings == whole.warnings == ("geometry_0: wound inside out, its faces are turned",)
-    for (one, _, smooth), (other, _, as_smooth) in zip(mesh_parts(whole), mesh_parts(scaled), strict=True):
-        assert as_smooth == smooth
+    for one, other in zip(mesh_parts(whole), mesh_parts(scaled), strict=True):
+        assert other.metadata["smooth"] == one.metadata["smooth"]
         assert np.array_equal(other.vertices, one.vertices)
         assert np.array_equal(other.faces, one.faces)
         assert np.array_equal(other.vertex_normals, one.vertex_normals)
@@ -514,8 +514,8 @@ def test_too_many_faces_are_decimated_where_the_looks_survive(tmp_path):
     mesh = prepare_scene(trimesh.Scene(ball.copy()), "ball", max_faces=2000)
     assert warning(mesh) == f"decimated from {len(ball.faces)} to {mesh.face_count} triangles"
     assert 1000 < mesh.face_count <= 2000
-    part, _, smooth = mesh_parts(mesh)[0]
-    assert smooth
+    part = mesh_parts(mesh)[0]
+    assert part.metadata["smooth"]
     assert np.isclose(outwards(part), 4 / 3 * np.pi, rtol=0.02)
 
     ball.visual.vertex_colors = np.where(ball.vertices[:, 2:] > 0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])

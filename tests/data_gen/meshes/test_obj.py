@@ -16,7 +16,7 @@ PAINT = "newmtl paint\nKd 1 0 0\n"
 
 
 def only_part(mesh):
-    ((part, _, _),) = mesh_parts(mesh)
+    (part,) = mesh_parts(mesh)
     return part
 
 
@@ -54,8 +54,8 @@ def test_a_seam_of_the_texture_is_no_edge_of_the_surface(tmp_path):
         [f"{v + 1}/{3 * row + column + 1}" for column, v in enumerate(face)] for row, face in enumerate(ball.faces)
     ]
     mesh = load_mesh(write_obj(tmp_path, mtl=PAINT, body=rows + "".join(f"f {' '.join(face)}\n" for face in faces)))
-    ((part, _, smooth),) = mesh_parts(mesh)
-    assert smooth
+    (part,) = mesh_parts(mesh)
+    assert part.metadata["smooth"]
     outward = part.vertices / np.linalg.norm(part.vertices, axis=1, keepdims=True)
     assert (part.vertex_normals * outward).sum(axis=1).min() > 0.999
 

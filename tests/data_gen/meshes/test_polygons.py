@@ -36,7 +36,7 @@ def test_a_polygon_is_covered_once_wherever_it_begins(polygon, plane):
 
 def area_in_file(mesh):
     scale = np.linalg.det(mesh.world_from_file[:3, :3]) ** (2 / 3)
-    return sum(part.area for part, _, _ in mesh_parts(mesh)) / scale
+    return sum(part.area for part in mesh_parts(mesh)) / scale
 
 
 def write(folder, kind):
@@ -76,7 +76,7 @@ def test_quadrilaterals_of_a_ply_keep_their_colours(tmp_path):
     head += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     points = "0 0 0\n1 0 0\n2 0 0\n0 1 0\n1 1 0\n2 1 0\n"
     (tmp_path / "a.ply").write_text(head + points + "4 0 1 4 3 255 0 0\n4 1 2 5 4 0 0 255\n")
-    ((part, _, _),) = mesh_parts(load_mesh(tmp_path / "a.ply"))
+    (part,) = mesh_parts(load_mesh(tmp_path / "a.ply"))
     left = part.triangles_center[:, 0] < 0
     assert part.visual.face_colors[left].tolist() == [[255, 0, 0, 255]] * 2
     assert part.visual.face_colors[~left].tolist() == [[0, 0, 255, 255]] * 2
@@ -88,5 +88,5 @@ def test_coordinates_without_a_texture_leave_the_default_colour(tmp_path):
     )
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     (tmp_path / "a.ply").write_text(head + "0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n")
-    ((part, _, _),) = mesh_parts(load_mesh(tmp_path / "a.ply"))
+    (part,) = mesh_parts(load_mesh(tmp_path / "a.ply"))
     assert part.visual.material.baseColorFactor.tolist() == [153, 153, 153, 255]

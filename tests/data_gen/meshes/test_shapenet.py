@@ -25,7 +25,7 @@ def write_model(root, synset, model, version, *, texture=None):
 
 
 def texel(mesh):
-    ((part, _, _),) = mesh_parts(mesh)
+    (part,) = mesh_parts(mesh)
     return part.visual.material.baseColorTexture.getpixel((0, 0))
 
 

@@ -16,15 +16,22 @@ def sheet(size=1.0, *, uv=True):
     mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
     if uv:
         mesh.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]])
+    mesh.metadata["smooth"] = False
     return mesh
 
 
+def placed(mesh, pose):
+    """A copy of a mesh in the coordinates that a transform leads to."""
+    return mesh.copy().apply_transform(pose)
+
+
 def tricky_parts():
-    """Parts with a texture, vertex colours, face colours, reversed faces, a mirroring pose, a cutoff and glass."""
+    """Parts with a texture, vertex colours, face colours, reversed faces, a mirrored one, a cutoff and glass."""
     generator = np.random.default_rng(0)
     texels = generator.integers(0, 255, (16, 16, 3), dtype=np.uint8).repeat(16, axis=0).repeat(16, axis=1)
     textured = trimesh.creation.box((0.6, 0.6, 0.6))
     uv = generator.uniform(0.0, 1.0, (len(textured.vertices), 2))
+    textured.metadata["smooth"] = False
     textured.visual = trimesh.visual.TextureVisuals(uv=uv, image=Image.fromarray(texels))
     ball = trimesh.creation.icosphere(3, radius=0.3)
     ball.visual.vertex_colors = np.clip(ball.vertices * 400 + 128, 0, 255).astype(np.uint8)
@@ -44,11 +51,11 @@ def tricky_parts():
     place = trimesh.transformations.translation_matrix
     mirrored = place([0.2, 0.5, 0.2]) @ np.diag([-1.0, 1.5, 1.0, 1.0])
     return [
-        (textured, place([-0.4, -0.3, 0.0]), False),
-        (ball, place([0.4, 0.0, -0.2]), True),
-        (block, mirrored, True),
-        (glass, place([0.0, 0.0, 0.55]), False),
-        (fence, place([-0.2, 0.3, -0.6]) @ trimesh.transformations.rotation_matrix(0.4, [0, 1, 0]), False),
+        placed(textured, place([-0.4, -0.3, 0.0])),
+        placed(ball, place([0.4, 0.0, -0.2])),
+        placed(block, mirrored),
+        placed(glass, place([0.0, 0.0, 0.55])),
+        placed(fence, place([-0.2, 0.3, -0.6]) @ trimesh.transformations.rotation_matrix(0.4, [0, 1, 0])),
     ]
 
 

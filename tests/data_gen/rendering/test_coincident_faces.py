@@ -14,8 +14,6 @@ from data_gen.rendering.renderers import probe
 from data_gen.rigs import Rig
 from data_gen.shapes import make
 
-EYE = np.eye(4)
-
 
 @pytest.fixture(params=["pyrender-egl", "embree"])
 def backend(request):
@@ -67,13 +65,13 @@ def test_of_faces_in_one_place_the_one_that_faces_the_camera_is_seen(backend, ki
     sides = _doubled(kind)
     rig = rigs.fixed(6, 64)
     with MeshRenderer(backend) as renderer:
-        parts = [(_painted(side, colour), EYE, False) for side, colour in zip(sides, colours, strict=True)]
+        parts = [_painted(side, colour) for side, colour in zip(sides, colours, strict=True)]
         found = renderer.render(parts, rig).rgba.astype(int)
         off = 0.0
         for view, pose in enumerate(rig.world_from_camera):
             one = Rig(pose[None], rig.intrinsics[view], 64, 64, rig.near, rig.far)
             kept = [(_culled(side, pose[:3, 3]), colour) for side, colour in zip(sides, colours, strict=True)]
-            parts = [(_painted(corners, colour), EYE, False) for corners, colour in kept if len(corners)]
+            parts = [_painted(corners, colour) for corners, colour in kept if len(corners)]
             expected = renderer.render(parts, one).rgba[0].astype(int)
             seen = (expected[..., 3] > 0) | (found[view, ..., 3] > 0)
             wrong = (np.abs(expected - found[view]) > 25).any(axis=-1)
@@ -84,7 +82,7 @@ def test_of_faces_in_one_place_the_one_that_faces_the_camera_is_seen(backend, ki
 def test_doubled_glass_is_blended_once(backend):
     pane = np.array([[[-1, -1, 0], [1, -1, 0], [0, 1, 0]]], dtype=float)
     rig = rigs.orbit(2, 16, elevation=0.0)
-    parts = [(_painted(side, (250, 250, 250, 102)), EYE, False) for side in (pane, pane[:, ::-1])]
+    parts = [_painted(side, (250, 250, 250, 102)) for side in (pane, pane[:, ::-1])]
     with MeshRenderer(backend) as renderer:
         alpha = renderer.render(parts, rig).rgba[:, 8, 8, 3]
     np.testing.assert_allclose(alpha, 102, atol=1)
@@ -108,7 +106,7 @@ def test_what_has_one_side_only_is_still_seen_from_both(backend):
     wall = 2 * sheet + [0, 0, 0.002]
     rig = rigs.orbit(2, 32, elevation=0.0)
     with MeshRenderer(backend) as renderer:
-        parts = [(_painted(sheet, (220, 30, 30, 255)), EYE, False), (_painted(wall, (30, 30, 220, 255)), EYE, False)]
+        parts = [_painted(sheet, (220, 30, 30, 255)), _painted(wall, (30, 30, 220, 255))]
         front, back = renderer.render(parts, rig).rgba[:, 15, 16]
     assert front[2] > front[0]
     assert back[0] > back[2]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from drawn_parts import draw_tricky, sheet
+from drawn_parts import draw_tricky, placed, sheet
 from PIL import Image
 
 from data_gen import rigs
@@ -25,7 +25,6 @@ from data_gen.rendering.surfaces import shaded_surfaces
 from data_gen.shapes import ONE_SIDED, make
 
 DARK = Lighting((), sky=(0.0,) * 3, ground=(0.0,) * 3)
-EYE = np.eye(4)
 HERE = [name for name in RENDERERS if name != "pyrender-osmesa"]
 
 
@@ -83,7 +82,7 @@ def test_convention_spheres_are_where_kornia_projects_them(backend, resolution):
     with MeshRenderer(backend, supersample=8) as renderer:
         for number, centre in enumerate(centres):
             ball = _emissive(trimesh.creation.icosphere(3, radius=0.08))
-            alpha = renderer.render([(ball, trimesh.transformations.translation_matrix(centre), True)], rig).rgba[
+            alpha = renderer.render([placed(ball, trimesh.transformations.translation_matrix(centre))], rig).rgba[
                 ..., 3
             ]
             weights = alpha / alpha.sum(axis=(1, 2), keepdims=True, dtype=float)
@@ -102,7 +101,7 @@ def test_alpha_is_the_covered_area_of_the_pixel(backend):
     down = np.clip(np.minimum(v1, pixel + 0.5) - np.maximum(v0, pixel - 0.5), 0.0, 1.0)
     for supersample in (1, 3, 8):
         with MeshRenderer(backend, supersample=supersample) as renderer:
-            alpha = renderer.render([(sheet(size), EYE, False)], rig).rgba[0, ..., 3] / 255.0
+            alpha = renderer.render([sheet(size)], rig).rgba[0, ..., 3] / 255.0
         # Samples stand 1 / supersample apart, so an edge is off by at most half of that.
         np.testing.assert_allclose(alpha, down[:, None] * across, atol=1.01 / supersample / 2 + 0.004)
 
@@ -111,7 +110,7 @@ def test_sphere_silhouette_has_the_area_of_its_cone(backend):
     rig = _front_rig(100)
     ball = trimesh.creation.icosphere(5, radius=0.8)
     with MeshRenderer(backend, supersample=4) as renderer:
-        alpha = renderer.render([(ball, EYE, True)], rig).rgba[0, ..., 3] / 255.0
+        alpha = renderer.render([ball], rig).rgba[0, ..., 3] / 255.0
     radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(0.8 / 3.0))
     # 0.05 pixels of the radius: icospheres are inscribed.
     assert abs(np.sqrt(alpha.sum() / np.pi) - radius) < 0.05
@@ -124,7 +123,7 @@ def test_no_dark_fringe_over_white(backend):
     # An emissive off-white sphere over white: every pixel, edge or not, lies between the two colours.
     ball = _emissive(trimesh.creation.icosphere(4, radius=0.8), (240, 240, 240))
     with MeshRenderer(backend) as renderer:
-        rgba = renderer.render([(ball, EYE, True)], rigs.fixed(2, 64), lighting=DARK).rgba
+        rgba = renderer.render([ball], rigs.fixed(2, 64), lighting=DARK).rgba
     inside = rgba[rgba[..., 3] == 255]
     flat = inside[0, 0]
     assert (inside[:, :3] == flat).all()
@@ -179,7 +178,7 @@ def test_osmesa_and_embree_agree(tricky_by_embree, tmp_path):
 def test_same_bytes_in_every_run_and_process(backend, drawn_elsewhere):
     first = draw_tricky(backend)
     with MeshRenderer(backend) as renderer:
-        renderer.render([(sheet(), EYE, False)], _front_rig((31, 17)))
+        renderer.render([sheet()], _front_rig((31, 17)))
     assert np.array_equal(first, draw_tricky(backend))
     assert np.array_equal(first, drawn_elsewhere[backend])
 
@@ -189,8 +188,8 @@ def test_reversed_faces_look_like_any_others(backend):
     inside_out = ball.copy()
     inside_out.invert()
     with MeshRenderer(backend) as renderer:
-        right = renderer.render([(ball, EYE, True)], rigs.fixed(2, 48)).rgba
-        wrong = renderer.render([(inside_out, EYE, True)], rigs.fixed(2, 48)).rgba
+        right = renderer.render([ball], rigs.fixed(2, 48)).rgba
+        wrong = renderer.render([inside_out], rigs.fixed(2, 48)).rgba
     assert np.abs(right.astype(int) - wrong).max() <= 2
 
 
@@ -216,7 +215,7 @@ def test_inner_sides_of_generated_objects_are_never_seen(class_name):
 def test_a_sheet_is_seen_from_both_sides(backend):
     rig = rigs.orbit(2, 32, elevation=0.0)
     with MeshRenderer(backend) as renderer:
-        rgba = renderer.render([(sheet(), EYE, False)], rig).rgba
+        rgba = renderer.render([sheet()], rig).rgba
     assert (rgba[:, 16, 16, 3] == 255).all()
     assert rgba[:, 16, 16, :3].min() > 60
 
@@ -228,7 +227,7 @@ def test_glass_over_black_and_white_closed_form(backend):
     glass.visual.material.alphaMode = "BLEND"
     behind = trimesh.transformations.translation_matrix([0, 0, -0.5])
     with MeshRenderer(backend) as renderer:
-        rgba = renderer.render([(glass, EYE, False), (wall, behind, False)], _front_rig(33), lighting=DARK).rgba[0]
+        rgba = renderer.render([glass, placed(wall, behind)], _front_rig(33), lighting=DARK).rgba[0]
     np.testing.assert_allclose(rgba[16, 16], [102, 0, 153, 255], atol=2)
     np.testing.assert_allclose(rgba[16, 5], [255, 0, 0, 102], atol=2)
 
@@ -244,7 +243,7 @@ def test_of_the_translucent_faces_of_a_surface_the_nearer_is_in_front(backend, f
     panes.visual = trimesh.visual.ColorVisuals(panes, face_colors=colours)
     flat, rig = Lighting((), sky=(0.7,) * 3, ground=(0.7,) * 3), rigs.orbit(2, 33, elevation=0.0)
     with MeshRenderer(backend) as renderer:
-        front, back = renderer.render([(panes, EYE, False)], rig, lighting=flat).rgba[:, 16, 16].astype(int)
+        front, back = renderer.render([panes], rig, lighting=flat).rgba[:, 16, 16].astype(int)
     assert front[0] / (front[0] + front[2]) == pytest.approx(2 / 3, abs=0.02)
     np.testing.assert_allclose(back, front[[2, 1, 0, 3]], atol=1)
 
@@ -257,7 +256,7 @@ def test_transparent_texels_do_not_bleed(backend):
     square.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(texels))
     flat = Lighting((), sky=(0.7,) * 3, ground=(0.7,) * 3)
     with MeshRenderer(backend) as renderer:
-        rgba = renderer.render([(square, EYE, False)], _front_rig(40), lighting=flat).rgba[0]
+        rgba = renderer.render([square], _front_rig(40), lighting=flat).rgba[0]
     seen = rgba[rgba[..., 3] > 40].astype(int)
     assert len(seen) > 100
     assert (seen[:, 1] > seen[:, 1].max() - 12).all()
@@ -273,8 +272,8 @@ def test_what_is_behind_many_clear_sheets_is_seen(backend, alpha_mode):
         baseColorTexture=Image.fromarray(texels), alphaMode=alpha_mode
     )
     place = trimesh.transformations.translation_matrix
-    sheets = [(clear, place([0, 0, 0.02 * number]), False) for number in range(30)]
-    rig, back = _front_rig(9), (sheet(0.9), place([0, 0, -0.5]), False)
+    sheets = [placed(clear, place([0, 0, 0.02 * number])) for number in range(30)]
+    rig, back = _front_rig(9), placed(sheet(0.9), place([0, 0, -0.5]))
     with MeshRenderer(backend) as renderer:
         alone = renderer.render([back], rig, channels=("rgba", "depth"))
         behind = renderer.render([*sheets, back], rig, channels=("rgba", "depth"))
@@ -289,7 +288,7 @@ def test_texture_is_the_right_way_up(backend):
         image=Image.fromarray(quarters).resize((64, 64), Image.Resampling.NEAREST)
     )
     with MeshRenderer(backend) as renderer:
-        rgb = renderer.render([(square, EYE, False)], _front_rig(40)).rgba[0, ..., :3]
+        rgb = renderer.render([square], _front_rig(40)).rgba[0, ..., :3]
     bright = rgb > 100
     assert bright[12, 12].tolist() == [True, False, False]
     assert bright[12, 28].tolist() == [False, True, False]
@@ -313,17 +312,17 @@ def test_srgb_colours_come_out_alike_however_they_are_given(backend, kind, colou
     expected = 255 * (0.8 * ((np.array(colour) / 255 + 0.055) / 1.055) ** 2.4)
     expected = 255 * (1.055 * (expected / 255) ** (1 / 2.4) - 0.055)
     with MeshRenderer(backend) as renderer:
-        rgba = renderer.render([(square, EYE, False)], _front_rig(16), lighting=flat).rgba[0, 8, 8]
+        rgba = renderer.render([square], _front_rig(16), lighting=flat).rgba[0, 8, 8]
     np.testing.assert_allclose(rgba, [*expected, 255], atol=1.5)
 
 
 def test_geometry_lies_on_the_mesh_to_a_hundredth_of_a_pixel():
-    mesh = trimesh.creation.icosphere(2, radius=0.6)
     pose = trimesh.transformations.translation_matrix([0.1, -0.2, 0.3]) @ np.diag([1.0, 1.3, 0.7, 1.0])
+    mesh = placed(trimesh.creation.icosphere(2, radius=0.6), pose)
+    mesh.metadata["smooth"] = False
     rig = rigs.fixed(3, (50, 40))
     with MeshRenderer("embree", supersample=1) as renderer:
-        out = renderer.render([(mesh, pose, False)], rig, channels=CHANNELS)
-    placed = mesh.copy().apply_transform(pose)
+        out = renderer.render([mesh], rig, channels=CHANNELS)
     x, y = np.meshgrid(np.arange(50), np.arange(40))
     rays = np.stack((x, y, np.ones_like(x)), axis=-1) @ np.linalg.inv(rig.intrinsics[0]).T
     for view, world_from_camera in enumerate(rig.world_from_camera):
@@ -331,11 +330,11 @@ def test_geometry_lies_on_the_mesh_to_a_hundredth_of_a_pixel():
         assert np.array_equal(mask, depth > 0)
         points = (rays * depth[..., None])[mask] @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
         footprint = depth[mask].max() / rig.intrinsics[0, 0, 0]
-        face, distance = _closest(placed, points)
+        face, distance = _closest(mesh, points)
         assert distance.max() < 0.01 * footprint
         np.testing.assert_allclose(out.coordinates[view][mask], points, atol=1e-5)
         normals = out.normals[view][mask]
-        aligned = np.abs(np.einsum("pi,pi->p", normals, placed.face_normals[face]))
+        aligned = np.abs(np.einsum("pi,pi->p", normals, mesh.face_normals[face]))
         assert np.quantile(aligned, 0.02) > 0.999
         towards = world_from_camera[:3, 3] - points
         assert (np.einsum("pi,pi->p", normals, towards) > 0).all()
@@ -352,7 +351,7 @@ def test_geometry_looks_through_what_is_mostly_clear():
     with MeshRenderer("embree") as renderer:
         for alpha, depth in ((100, 3.5), (200, 3.0)):
             glass.visual.material.baseColorFactor = [0, 0, 0, alpha]
-            out = renderer.render([(glass, EYE, False), (wall, behind, False)], _front_rig(9), channels=("depth",))
+            out = renderer.render([glass, placed(wall, behind)], _front_rig(9), channels=("depth",))
             assert out.rgba is None
             np.testing.assert_allclose(out.depth[0, 4, 4], depth, atol=1e-6)
 
@@ -368,21 +367,16 @@ def test_blank_and_impossible_objects_are_named(backend):
     rig = _front_rig(8)
     with MeshRenderer(backend) as renderer:
         for parts, message in (
-            ([(sheet(), away, False)], "teapot: expected some of it to be visible in 1 views"),
+            ([placed(sheet(), away)], "teapot: expected some of it to be visible in 1 views"),
             ([], "teapot: expected at least one face, received 0 parts"),
-            ([(empty, EYE, False)], "teapot: expected at least one face, received 1 parts"),
-            ([(broken, EYE, False)], "teapot, part 0: expected finite vertices, received 1 faces"),
-            (
-                [(sheet(), EYE, False), ("cube", EYE, False)],
-                "teapot, part 1: expected a trimesh.Trimesh, received str",
-            ),
-            ([(sheet(), np.eye(3), False)], "teapot, part 0: expected a finite affine pose"),
-            ([(several, EYE, False)], "part 0: expected a PBRMaterial or a SimpleMaterial, received MultiMaterial"),
-            ([(untextured, EYE, False)], "texture coordinates for its 4 textured vertices, received none"),
+            ([empty], "teapot: expected at least one face, received 1 parts"),
+            ([broken], "teapot, part 0: expected finite vertices, received 1 faces"),
+            ([several], "part 0: expected a PBRMaterial or a SimpleMaterial, received MultiMaterial"),
+            ([untextured], "texture coordinates for its 4 textured vertices, received none"),
         ):
             with pytest.raises(RenderError, match=message):
                 renderer.render(parts, rig, name="teapot")
-        assert renderer.render([(sheet(), EYE, False)], rig).rgba.any()
+        assert renderer.render([sheet()], rig).rgba.any()
 
 
 def test_wrong_arguments_say_what_was_received():
@@ -392,15 +386,15 @@ def test_wrong_arguments_say_what_was_received():
         MeshRenderer("vulkan")
     renderer = MeshRenderer("embree")
     with pytest.raises(ValueError, match="rgba, depth, normals, coordinates, mask, received rgb"):
-        renderer.render([(sheet(), EYE, False)], _front_rig(8), channels=("rgb",))
+        renderer.render([sheet()], _front_rig(8), channels=("rgb",))
     renderer.close()
     with pytest.raises(ValueError, match="received one that was closed"):
-        renderer.render([(sheet(), EYE, False)], _front_rig(8))
+        renderer.render([sheet()], _front_rig(8))
 
 
 def test_rasterisers_share_the_context_and_other_threads_are_refused():
     _skip_unless_working("pyrender-egl")
-    parts, rig = [(sheet(), EYE, False)], _front_rig(8)
+    parts, rig = [sheet()], _front_rig(8)
     caught = []
 
     def elsewhere():
@@ -431,7 +425,7 @@ def test_unreferenced_bad_vertices_and_vanished_normals_do_no_harm():
     corners = [[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [np.nan, 0, 0]]
     mesh = trimesh.Trimesh(corners, [[0, 1, 2]], vertex_normals=np.zeros((4, 3)), process=False, validate=False)
     with MeshRenderer("embree") as renderer:
-        out = renderer.render([(mesh, EYE, True)], _front_rig(9), channels=("rgba", "normals"))
+        out = renderer.render([mesh], _front_rig(9), channels=("rgba", "normals"))
     assert out.rgba[0, 4, 4, :3].min() > 80
     np.testing.assert_allclose(out.normals[0, 4, 4], [0, 0, 1], atol=1e-6)
 
@@ -441,7 +435,7 @@ def test_metal_is_not_black_and_unset_metal_is_no_metal():
         square = sheet(0.9)
         square.visual.material = trimesh.visual.material.PBRMaterial(baseColorFactor=[128, 128, 128, 255], **material)
         with MeshRenderer("embree") as renderer:
-            return int(renderer.render([(square, EYE, False)], _front_rig(8)).rgba[0, 4, 4, 0])
+            return int(renderer.render([square], _front_rig(8)).rgba[0, 4, 4, 0])
 
     assert shade() == shade(metallicFactor=0.0)
     assert shade(metallicFactor=1.0) > 0.8 * shade()
@@ -451,7 +445,7 @@ def test_equal_textures_of_parts_share_their_texels():
     def part():
         square = sheet()
         square.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), (9, 8, 7)))
-        return square, EYE, False
+        return square
 
     one, other = shaded_surfaces([part(), part()])
     assert one.texture is other.texture
