@@ -18,7 +18,7 @@ import trimesh
 
 from data_gen import SUPERSAMPLE
 from data_gen.rendering.lighting import Lighting, resolve_lighting
-from data_gen.rendering.renderers import REMEDIES, RENDERERS, RendererError, RendererInfo, find_renderer
+from data_gen.rendering.renderers import REMEDIES, RENDERERS, RendererError, find_renderer
 from data_gen.rendering.surfaces import RenderError, ShadedSurface, shaded_surfaces
 from data_gen.rigs import Rig
 
@@ -74,7 +74,7 @@ class MeshRenderer:
     must all be used in the thread that made the first.
 
     Args:
-        renderer: what `find_renderer` returned, the name of a renderer, or None for the best that works here.
+        renderer: the name of a renderer, or None for the best that works here.
         supersample: samples along a side of a pixel, 1 to MAX_SUPERSAMPLE: 3 gives alpha ten values, 4 seventeen.
 
     Raises:
@@ -87,10 +87,10 @@ class MeshRenderer:
         supersample: samples along a side of a pixel.
     """
 
-    def __init__(self, renderer: RendererInfo | str | None = None, supersample: int = SUPERSAMPLE) -> None:
+    def __init__(self, renderer: str | None = None, supersample: int = SUPERSAMPLE) -> None:
         if not 1 <= supersample <= MAX_SUPERSAMPLE:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, received {supersample}")
-        self.name = renderer if isinstance(renderer, str) else (renderer or find_renderer()).name
+        self.name = renderer or find_renderer().name
         self.supersample = supersample
         self._renderer: ViewRenderer | None = _make_renderer(self.name)
         self.detail = self._renderer.detail
