@@ -124,14 +124,9 @@ class GenerationConfig:
         return replace(config, renderer=find_renderer(self.renderer).name)
 
     def make_rig(self, name: str, class_name: str | None = None) -> Rig:
-        """The cameras of an object, as a resolved configuration has them.
+        """The cameras of an object, of a resolved configuration.
 
-        Args:
-            name: of the object, on which random rigs depend.
-            class_name: of the object, on which the distance may depend.
-
-        Returns:
-            The rig.
+        Random rigs depend on the object's name, and the distance may depend on its class.
         """
         assert self.views is not None
         assert self.resolution is not None

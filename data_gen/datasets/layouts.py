@@ -152,10 +152,6 @@ def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
 def check_names(layout: str, names: Sequence[str]) -> None:
     """Refuse objects that a layout would give one name.
 
-    Args:
-        layout: of the data set.
-        names: of all objects.
-
     Raises:
         ValueError: two of them differ by hyphens and underscores alone, in the layout hyperplanes-200.
     """

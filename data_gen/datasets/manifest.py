@@ -115,9 +115,6 @@ def holds_data_set(folder: Path) -> bool:
 def verify(folder: str | Path) -> Verification:
     """Compare every file of a data set with its checksum in the manifest.
 
-    Args:
-        folder: the data set.
-
     Returns:
         What is missing or changed. DataError where there is no manifest, or one without checksums.
     """

@@ -41,10 +41,6 @@ def main() -> int:
 def process_item(process: Callable[[Any], dict[str, Any]], item: Any) -> dict[str, Any]:
     """Process one item, and catch what it raises.
 
-    Args:
-        process: the function of an item.
-        item: the item.
-
     Returns:
         {"ok": result}, {"skip": reason} or {"fatal": reason}; nothing is raised.
     """

@@ -30,10 +30,6 @@ _MOST_FACES_TO_CLOSE = 500_000
 def check_faces(mesh: trimesh.Trimesh, label: str) -> None:
     """Refuse faces on vertices that are not there.
 
-    Args:
-        mesh: as it was read.
-        label: what messages call it.
-
     Raises:
         ValueError: a face refers to a vertex that is not there.
     """
@@ -107,9 +103,6 @@ def is_smooth(mesh: trimesh.Trimesh) -> bool:
 
 def smooth_normals(mesh: trimesh.Trimesh) -> npt.NDArray[np.float64] | None:
     """Normals `(vertex, 3)` of a mesh without its own, the same on both sides of a seam of its texture.
-
-    Args:
-        mesh: a mesh that is smooth.
 
     Returns:
         The normals; None where the mesh has some, or has no seams.

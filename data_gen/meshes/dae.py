@@ -29,10 +29,6 @@ _NOT_DRAWN = ("lines", "linestrips", "points", "spline", "brep", "convex_mesh")
 def read_dae(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
     """The geometries of a COLLADA file, factors of materials as in the file (sRGB), and warnings.
 
-    Args:
-        data: the content of the file.
-        folder: gives the other files of the model.
-
     Returns:
         The scene, and warnings that name what is not drawn as the file states.
 

@@ -60,11 +60,7 @@ class MeshError(ValueError):
 
 
 def read_bytes(path: Path, *, limit: int) -> bytes:
-    """Read a file whose size is checked first.
-
-    Args:
-        path: the file.
-        limit: bytes at most.
+    """Read a file of at most `limit` bytes, whose size is checked first.
 
     Returns:
         The content.
@@ -86,12 +82,7 @@ def read_bytes(path: Path, *, limit: int) -> bytes:
 
 
 def check_image(data: bytes, name: str, *, limit: int) -> int:
-    """Decode an image, after its size was checked, to see that it is whole.
-
-    Args:
-        data: the bytes of an image file.
-        name: what it is called in a message.
-        limit: pixels at most.
+    """Decode an image of at most `limit` pixels, after its size was checked, to see that it is whole.
 
     Returns:
         Its number of pixels.

@@ -66,9 +66,6 @@ def safe_name(text: str) -> str:
 
     Other letters can be shown by few fonts, those of our contact sheets and of matplotlib not among them.
 
-    Args:
-        text: any text.
-
     Returns:
         The name, `mesh` if nothing of the text is left; with a checksum of the text where letters are lost.
 

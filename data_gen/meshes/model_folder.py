@@ -44,9 +44,6 @@ def without_comment(name: str) -> str:
 def model_root(path: Path) -> Path:
     """The folder that holds all files of a model.
 
-    Args:
-        path: a mesh file.
-
     Returns:
         That of the ID for ShapeNet's `ID/models/model_normalized.obj`, whose textures are in `ID/images`; that of NAME
         for Gazebo's `NAME/meshes/x.dae` where there is a `NAME/materials`; else the file's.
@@ -112,26 +109,12 @@ class ModelFolder(Resolver):
         self._images: set[Path] = set()
 
     def get(self, name: str) -> bytes:
-        """Give a file to a loader: one that was read before, or a texture.
-
-        Args:
-            name: how the mesh refers to it.
-
-        Returns:
-            Its content.
-        """
+        """Give a loader the content of a file: one that was read before, or a texture."""
         found = self._find(name)
         return self._bytes[found] if found in self._bytes else self.get_image(name)
 
     def read(self, name: str, *, limit: int = MAX_FILE_BYTES) -> bytes:
-        """Read a file of the model that is no texture.
-
-        Args:
-            name: how the mesh refers to it.
-            limit: bytes at most.
-
-        Returns:
-            Its content.
+        """The content of a file of the model that is no texture, of at most `limit` bytes.
 
         Raises:
             FileNotFoundError: if there is no such file, or it is empty; noted in `lost`.
@@ -150,14 +133,7 @@ class ModelFolder(Resolver):
         return self._bytes[found]
 
     def get_image(self, name: str) -> bytes:
-        """Read a texture of the model, which is decoded once to see that it is whole.
-
-        Args:
-            name: how the mesh refers to it.
-
-        Returns:
-            Its content.
-        """
+        """The content of a texture of the model, which is decoded once to see that it is whole."""
         found = self._find(name)
         if found not in self._images:
             self.count_pixels(self.read(name), name)
@@ -179,10 +155,6 @@ class ModelFolder(Resolver):
     def count_pixels(self, data: bytes, name: str) -> None:
         """Check a texture and count its pixels.
 
-        Args:
-            data: the bytes of an image file.
-            name: what the mesh calls it.
-
         Raises:
             FileNotFoundError: if it cannot be decoded; noted in `lost`.
             MeshError: if the textures are too large.
@@ -200,9 +172,6 @@ class ModelFolder(Resolver):
         """Find a file of the model without reading it.
 
         What an absolute path names is never opened; a file of its name beside the mesh is.
-
-        Args:
-            name: how the mesh refers to it.
 
         Returns:
             The file, or None if there is none.

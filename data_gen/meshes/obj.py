@@ -63,10 +63,6 @@ class _Group:
 def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
     """Read an OBJ file and the materials and textures that it names.
 
-    Args:
-        data: the content of the file.
-        folder: gives the other files of the model.
-
     Returns:
         One geometry a material, in the file's coordinates; and warnings that name what was lost. Plain colours are
         linear in materials and sRGB at vertices. `metadata["smooth"]` is what the file's smoothing groups say, and

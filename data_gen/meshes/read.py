@@ -25,10 +25,6 @@ _READERS = {".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_s
 def read_scene(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
     """Read a mesh file of any format.
 
-    Args:
-        data: the content of the file.
-        folder: names the file and gives the others of its model.
-
     Returns:
         A scene in the file's coordinates, what its plain colours are, and warnings.
 

@@ -95,9 +95,6 @@ def find_models(folder: Path) -> list[ShapeNetModel]:
 def paper_split(models: list[ShapeNetModel]) -> dict[tuple[str, str], str]:
     """The split of the paper's 200 x 200 data, as AtlasNet's: a class's names sorted, 80 % to train, the rest to test.
 
-    Args:
-        models: the models, of any classes in any order.
-
     Returns:
         `train` or `test` by synset and model.
     """
@@ -112,9 +109,6 @@ def paper_split(models: list[ShapeNetModel]) -> dict[tuple[str, str], str]:
 
 def read_split_file(path: Path) -> dict[tuple[str, str], str]:
     """Read ShapeNet's official split, `all.csv` with `id,synsetId,subSynsetId,modelId,split`.
-
-    Args:
-        path: the file.
 
     Returns:
         `train`, `val` or `test` by synset and model.

@@ -46,10 +46,7 @@ def concave(polygons: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
 
 
 def triangulate(polygon: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Cut a polygon into triangles.
-
-    Args:
-        polygon: corners `(corner, 3)` in order, nearly in a plane.
+    """Cut a polygon `(corner, 3)`, nearly in a plane, into triangles.
 
     Returns:
         Corner indices `(corner - 2, 3)`, wound as the polygon; triangles that are not needed have three equal corners.

@@ -77,10 +77,6 @@ class EmbreeRenderer:
 def cast_geometry(surfaces: Sequence[ShadedSurface], rig: Rig) -> Iterator[Geometry]:
     """Depth, normals and coordinates at the centres of the pixels.
 
-    Args:
-        surfaces: what to look at.
-        rig: the cameras.
-
     Yields:
         The geometry of one view after the other.
     """

@@ -21,9 +21,6 @@ __all__ = ["draw_test_image"]
 def draw_test_image(name: str) -> str:
     """Draw half a picture full of red triangle and check it.
 
-    Args:
-        name: which renderer.
-
     Returns:
         What drew it, one line.
 

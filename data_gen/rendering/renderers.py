@@ -76,10 +76,7 @@ _cache: dict[str, ProbeResult] = {}
 
 
 def probe(name: str) -> ProbeResult:
-    """Try one renderer in a subprocess; a second call in this process answers from memory.
-
-    Args:
-        name: one of RENDERERS.
+    """Try one of RENDERERS in a subprocess; a second call in this process answers from memory.
 
     Returns:
         The outcome. A renderer that does not work is an outcome, not an error.

@@ -163,14 +163,7 @@ def _extras(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> list[Pa
 
 
 def car(rng: np.random.Generator) -> list[Part]:
-    """A car.
-
-    Args:
-        rng: source of every choice.
-
-    Returns:
-        Its parts in metres, y up, front along +z, standing on y = 0.
-    """
+    """A car: its parts in metres, y up, front along +z, standing on y = 0."""
     frame = sample_frame(rng, pick(rng, _SHARES))
     weights = np.array([paint[3] for paint in _PAINTS])
     hue, saturation, value, _ = _PAINTS[rng.choice(len(_PAINTS), p=weights / weights.sum())]

@@ -62,14 +62,7 @@ def _seat(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list
 
 
 def chair(rng: np.random.Generator) -> list[Part]:
-    """A chair.
-
-    Args:
-        rng: source of every choice.
-
-    Returns:
-        Its parts in metres, y up, the sitter looking along +z, standing on y = 0.
-    """
+    """A chair: its parts in metres, y up, the sitter looking along +z, standing on y = 0."""
     frame = _frame(rng)
     palette = sample_palette(rng, frame.kind)
     parts = _seat(rng, frame, palette) + legs(rng, frame, palette) + back(rng, frame, palette)

@@ -195,13 +195,6 @@ KINDS: dict[str, tuple[float, Callable[[np.random.Generator], list[Part]]]] = {
 
 
 def lamp(rng: np.random.Generator) -> list[Part]:
-    """A lamp.
-
-    Args:
-        rng: source of every choice.
-
-    Returns:
-        Its parts in metres, y up, front along +z.
-    """
+    """A lamp: its parts in metres, y up, front along +z."""
     kind = pick(rng, {name: share for name, (share, _) in KINDS.items()})
     return KINDS[kind][1](rng)

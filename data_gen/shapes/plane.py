@@ -28,13 +28,6 @@ KINDS: dict[str, tuple[float, Callable[[np.random.Generator], list[Part]]]] = {
 
 
 def plane(rng: np.random.Generator) -> list[Part]:
-    """A plane.
-
-    Args:
-        rng: source of every choice.
-
-    Returns:
-        Its parts in metres, y up, nose along +z.
-    """
+    """A plane: its parts in metres, y up, nose along +z."""
     kind = pick(rng, {name: share for name, (share, _) in KINDS.items()})
     return KINDS[kind][1](rng)

@@ -51,14 +51,7 @@ def _store(name: str, x: float, y: float, z: float, size: float) -> list[Part]:
 
 
 def fighter(rng: np.random.Generator) -> list[Part]:
-    """A fighter jet.
-
-    Args:
-        rng: source of every choice.
-
-    Returns:
-        Its parts in metres, y up, nose along +z.
-    """
+    """A fighter jet: its parts in metres, y up, nose along +z."""
     main, second = _skins(rng)
     length, width = rng.uniform(14.5, 18.5), rng.uniform(1.7, 2.3)
     height = rng.uniform(1.45, 1.7)

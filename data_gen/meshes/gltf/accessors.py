@@ -70,11 +70,7 @@ def _dtype(accessor: dict[str, Any]) -> np.dtype[Any]:
 
 
 def read_accessor(document: Document, index: int) -> npt.NDArray[Any]:
-    """The items of an accessor as the file holds them.
-
-    Args:
-        document: the file, whose accessors were checked.
-        index: which one.
+    """The items of an accessor, which was checked, as the file holds them.
 
     Returns:
         Its items `(item, column)`; `(item,)` for scalars.

@@ -81,11 +81,7 @@ def not_negative(index: int) -> int:
 
 
 def open_document(data: bytes, folder: ModelFolder) -> Document:
-    """Parse the container, check its extensions, and read its buffers.
-
-    Args:
-        data: the content of the file; GLB if the file is called so.
-        folder: gives the other files of the model.
+    """Parse the container, GLB where the file is called so, check its extensions, and read its buffers.
 
     Returns:
         The document; its buffer views lie inside their buffers.

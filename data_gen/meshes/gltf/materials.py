@@ -74,9 +74,6 @@ class GltfMaterial:
 def read_materials(document: Document) -> list[GltfMaterial]:
     """All materials of a file; what is lost of one is named in the document's warnings.
 
-    Args:
-        document: the file.
-
     Returns:
         The materials, plain factors linear. One whose base colour texture is lost is grey, where it would be white.
     """

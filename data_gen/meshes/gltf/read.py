@@ -28,11 +28,7 @@ _WORLD = "world"
 
 
 def read_gltf(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
-    """Read a glTF or GLB file whose buffers and textures have been checked.
-
-    Args:
-        data: the content of the file; GLB if the file is called so.
-        folder: gives the other files of the model.
+    """Read a glTF file, or a GLB file where it is called so, whose buffers and textures have been checked.
 
     Returns:
         Its scene; what its plain colours are (trimesh writes vertex colours as it holds them, sRGB); and warnings that

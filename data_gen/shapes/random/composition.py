@@ -174,9 +174,6 @@ def _composed(rng: np.random.Generator) -> list[Solid]:
 def composition(rng: np.random.Generator) -> list[Part]:
     """An object of random primitives, composed at random or as a rough structure.
 
-    Args:
-        rng: source of every choice.
-
     Returns:
         Its parts about the origin; any side may be up, but most stand upright.
     """

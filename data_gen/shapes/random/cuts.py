@@ -40,10 +40,6 @@ def _manifold(solid: Solid) -> tuple[manifold3d.Manifold, int]:
 def difference(solid: Solid, tool: Solid) -> Solid | None:
     """The part of a solid that lies outside another one.
 
-    Args:
-        solid: what is cut.
-        tool: what is taken away.
-
     Returns:
         The solid, in whose `cells` the first is `CUT` on faces that came from the tool; None where Manifold refuses
         one of the two, or nothing is left.

@@ -65,9 +65,6 @@ def cross(arm: float, count: int = AROUND) -> np.ndarray:
 def outline(rng: np.random.Generator) -> tuple[np.ndarray, float]:
     """An outline about the origin that fills the square of side 2, and the crease angle in degrees that suits it.
 
-    Args:
-        rng: source of every choice.
-
     Returns:
         Corners (AROUND, 2), counter-clockwise, star-shaped about their mean, and the angle.
     """
