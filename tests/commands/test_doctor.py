@@ -23,7 +23,6 @@ NONE = [ProbeResult("embree", False, "no module named embreex", "pip install emb
 
 def test_optional_parts_may_be_missing(monkeypatch, capsys):
     monkeypatch.setattr(renderers, "probe_all", lambda: WORKING)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name in doctor.OPTIONAL else object())
     assert main(["doctor"]) == 0
     shown = capsys.readouterr().out
