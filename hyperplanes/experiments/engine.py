@@ -16,7 +16,6 @@ from hyperplanes.adaptation.base import Pictures, Renderable
 from hyperplanes.adaptation.checkpoints import find_checkpoints
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.initialisation import LEARNED
-from hyperplanes.configuration.presets import PROTOCOLS
 from hyperplanes.data.support import Shown, WithSupport
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.experiments.configurations import scaled_preset
@@ -28,7 +27,7 @@ from hyperplanes.experiments.trainings import Train, Trainings
 from hyperplanes.experiments.workers import Result, Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.export.images import orbit_cameras, picture_paths, save_images
-from hyperplanes.methods import Request, Unchecked, WithSampler, make_method
+from hyperplanes.methods import Request, Unchecked, make_method
 from hyperplanes.utilities.checkpoints import read_json
 from hyperplanes.utilities.environment import find_processor
 from hyperplanes.utilities.writing import write_json
@@ -105,7 +104,7 @@ class Runner:
         self.workers = workers
         self.trainings = Trainings(workspace, data, train, workers)
         self._evaluated: dict[Path, Future[ObjectScore]] = {}  # by workers, by the files that they go to
-        self._method_in_use: tuple[object, tuple[WithSampler, Tasks]] | None = None
+        self._method_in_use: tuple[object, tuple[Unchecked, Tasks]] | None = None
 
     def run(self, experiment: Experiment, seeds: int, on_score: OnScore = lambda *_: None) -> Outcome:
         """All trainings and evaluations of an experiment.
@@ -213,6 +212,7 @@ class Runner:
             "seed": seed,
             "views": self._views(cell, checkpoint),
             "fine_tuning": stated(self.fine_tuning(cell)),
+            **self._own_sampling(cell),
             **({} if cell.query is None else {"query": cell.query}),
             **({"orbit": cell.orbit} if cell.orbit else {}),
             **({"measured_alone": self._measured_by()} if _is_time(cell) else {}),
@@ -273,7 +273,7 @@ class Runner:
 
     def _method(
         self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, seed: int
-    ) -> tuple[WithSampler, Tasks]:
+    ) -> tuple[Unchecked, Tasks]:
         """The adapter of a cell, and the objects with as many support views as it shows."""
         checkpoints = find_checkpoints([checkpoint])
         trainable = cell.trainable if "hyperplanes" in checkpoints else "weights"
@@ -289,14 +289,18 @@ class Runner:
             objects=(tasks.task(name).support for name in names),
             preset=scaled_preset(experiment, self.scale),
         )
-        sampling = None if cell.trained.packaged else PROTOCOLS[self.scale.protocol]
-        return WithSampler(Unchecked(make_method(request)), sampling), tasks
+        return Unchecked(make_method(request)), tasks
 
     def fine_tuning(self, cell: Cell) -> FineTuning:
         """Rays, optimiser and rates of the gradient steps of a cell; a learned initialisation states its own."""
         if cell.trained.method in LEARNED:
             return FineTuning()
         return self.scale.scratch if "_scratch_" in cell.method else self.scale.fine_tuning
+
+    def _own_sampling(self, cell: Cell) -> dict[str, Any]:
+        """How a learned initialisation is sampled, where the scale has it otherwise than its protocol; JSON-able."""
+        sampling = self.scale.learned.get("model.sampling") if cell.trained.method in LEARNED else None
+        return {} if sampling is None else {"sampling": repr(sampling)}
 
     def _views(self, cell: Cell, checkpoint: Path) -> int:
         """How many support views a cell shows: as many as the model has planes, where it does not say."""

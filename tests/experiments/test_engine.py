@@ -10,15 +10,21 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import pytest
+import torch
 from rendered_here import rendered_here
 
+from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.cli import main
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.experiments import EXPERIMENTS, SCALES
+from hyperplanes.experiments.data_sets import DataSets
+from hyperplanes.experiments.engine import Runner
+from hyperplanes.experiments.workspace import Workspace
 from hyperplanes.methods import Request, make_method
 from hyperplanes.rendering import Hierarchical
+from tests.reference_rendering import Balls
 
 CLASSES = ("car", "chair", "lamp", "plane")
 
@@ -168,10 +174,42 @@ def test_what_the_paper_has_of_other_sources_reaches_trainings_and_evaluations(o
     assert (learned["protocol"], learned["sampling"]["coarse"], learned["coarse_network"]) == ("hierarchical", 4, False)
     written = [json.loads(path.read_text())["settings"] for path in (out / "evaluations").glob("car-*.json")]
     (found,) = (settings for settings in written if "legacy" in settings)
+    assert found["sampling"] == repr(Hierarchical(4, 0))
     assert found["bounds"] == {"centre": [0.0, 0.0, 0.0], "radius": 2.0}
     results = json.loads((out / "shapenet" / "results.json").read_text())
     assert list(results["table"]) == ["MV Meta, 25 views"]
     assert "--only Cars 'MV Meta, 25 views' --legacy" in results["command"]
+
+
+@pytest.mark.parametrize("name", SCALES)
+def test_fields_are_sampled_as_their_models_are_trained(name, tmp_path, monkeypatch):
+    """Source of truth: the configuration of the training; of each kind of model and of method one cell is adapted."""
+    monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
+    shape = {"model.network.depth": 1, "model.network.width": 8, "model.network.point_frequencies": 1}
+    reader = {"model.hypernetwork.encoder": "convnet", "model.hypernetwork.width": 8, "model.hull_resolution": 8}
+    scale = SCALES[name]
+    scale = replace(scale, changes={**scale.changes, **shape, **reader}, learned={**scale.learned, **shape}, views=8)
+    scale = replace(scale, max_steps=1, max_curve_steps=1)
+
+    def train(trained, chosen, data, reference, folder):
+        model = HyperPlanes(chosen.model)
+        model.set_rig(data.task("train0").support)
+        model.save_pretrained(folder)
+
+    cpu, seen = torch.device("cpu"), set()
+    data = DataSets(Workspace(tmp_path), scale, generate=None, device=cpu, given=dict.fromkeys(CLASSES, tmp_path))
+    runner = Runner(data.workspace, data, train=train, device=cpu)
+    for experiment in map(scale.applied, EXPERIMENTS.values()):
+        for cell in experiment.cells:
+            method, trained = scale.method(cell.method), cell.trained
+            kind = experiment.size, trained.method, trained.changes.get("model.target"), method.rstrip("0123456789")
+            if trained.packaged or kind in seen:
+                continue
+            seen.add(kind)
+            folder = runner.trainings.folder(experiment, trained, 0)
+            adapter, tasks = runner._method(experiment, cell, method, folder, 0)
+            field = adapter.adapt(tasks.task("test0").support)
+            assert field.sampling == runner.trainings.configuration(experiment, trained, 0).model.sampling, cell
 
 
 def test_seeds_are_of_trainings(out, given):
