@@ -11,7 +11,7 @@ import multiprocessing
 import signal
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
@@ -47,6 +47,9 @@ class Workers:
     Args:
         count: of processes.
         make: makes what a process does its work with; pickled.
+
+    Raises:
+        ChildProcessError: at the end of the context, where a process was killed within it.
     """
 
     def __init__(self, count: int, make: Callable[[], HasData]) -> None:
@@ -73,6 +76,11 @@ class Workers:
                 child.join(max(0.0, until - time.monotonic()))
                 child.kill()
         self._pool.shutdown()
+        if isinstance(error, BrokenExecutor):
+            raise ChildProcessError(
+                f"workers: expected {self.count} processes to the end, found that one was killed or ended by itself, "
+                "perhaps for want of memory; give fewer --workers, and the same command goes on"
+            ) from error
 
     def submit(self, folders: Mapping[str, Path], work: Callable[[Any], Result]) -> Future[Result]:
         """Do a piece of work in a process, as soon as one is free.
