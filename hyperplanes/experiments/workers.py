@@ -89,7 +89,12 @@ class Workers:
             folders: of the data sets by class; a worker generates none.
             work: called with what `make` made in the process; pickled, as its result is.
         """
-        return self._started().submit(_do, folders, work)
+        pool = self._started()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # of processes that this starts, too
+        try:
+            return pool.submit(_do, folders, work)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _started(self) -> ProcessPoolExecutor:
         if self._pool is None:
@@ -104,6 +109,7 @@ _runner: HasData  # of a worker process
 def _start(make: Callable[[], HasData]) -> None:
     global _runner
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which ends its workers
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     torch.set_num_threads(1)
     _runner = make()
 
