@@ -79,7 +79,7 @@ class Experiment:
         where: its labels in the paper's LaTeX source.
         size: pixels a side of the paper's images: 128 or 200.
         epochs: of the paper's trainings, by class; a number for all of them.
-        runs: with other seeds, in the paper.
+        runs: with other seeds, in the paper; None where it does not say how many.
         cells: row by row.
         figure: "bars" of the table, "curves" of the trainings, "boxes" over seeds and objects, or "steps": PSNR over
             the numbers of steps in the columns' headings.
@@ -96,7 +96,7 @@ class Experiment:
     where: str
     size: int
     epochs: Mapping[str, int] | int
-    runs: int
+    runs: int | None
     cells: tuple[Cell, ...]
     figure: Literal["bars", "curves", "boxes", "steps"]
     published: PublishedTable | None = None

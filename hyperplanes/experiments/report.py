@@ -101,11 +101,11 @@ def what_differs(outcome: Outcome) -> list[str]:
         lines.append(f"At most {scale.max_steps} gradient steps on the support views of an object.")
     if experiment.figure == "steps" and scale.max_curve_steps is not None:
         lines.append(f"At most {scale.max_curve_steps:,} gradient steps on the support views of an object.")
-    if scale.evaluated is not None:
+    if scale.evaluated is not None and experiment.objects is None:
         counts = sorted({len(score.objects) for score in outcome.scores.values()})
         count = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
         lines.append(f"Judged by {count} object{'' if count == '1' else 's'} a class. Paper: all test objects.")
-    lines.append(f"{_seeds(outcome)}. Paper: {experiment.runs}.")
+    lines.append(f"{_seeds(outcome)}. Paper: {experiment.runs or 'not stated'}.")
     silent = [
         name for name in SILENT if any(cell.column == name or cell.row.endswith(name) for cell in experiment.cells)
     ]

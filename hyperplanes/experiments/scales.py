@@ -68,8 +68,8 @@ class Scale:
     data: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
     def seeds(self, experiment: Experiment) -> int:
-        """How many seeds of an experiment are run: as many as in the paper, or as the scale has."""
-        return experiment.runs if self.most_seeds is None else self.most_seeds
+        """How many seeds of an experiment are run: as the scale has, or as the paper, one where it does not say."""
+        return (experiment.runs or 1) if self.most_seeds is None else self.most_seeds
 
     def applied(self, experiment: Experiment) -> Experiment:
         """The experiment with the rows and the numbers of steps that the scale has."""
