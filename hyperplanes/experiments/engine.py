@@ -292,8 +292,12 @@ class Runner:
         return Unchecked(make_method(request)), tasks
 
     def fine_tuning(self, cell: Cell) -> FineTuning:
-        """Rays, optimiser and rates of the gradient steps of a cell; a learned initialisation states its own."""
-        if cell.trained.method in LEARNED:
+        """Rays, optimiser and rates of the gradient steps of a cell; a learned initialisation states its own.
+
+        What a scale has for the hypernetwork alone is not for all weights: these are fine-tuned as by `render`.
+        """
+        for_all_weights = self.scale.fine_tuning.trainable == "weights"
+        if cell.trained.method in LEARNED or (cell.trainable == "weights" and not for_all_weights):
             return FineTuning()
         return self.scale.scratch if "_scratch_" in cell.method else self.scale.fine_tuning
 

@@ -15,6 +15,7 @@ from rendered_here import rendered_here
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.cli import main
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import WithSupport
 from hyperplanes.evaluation import evaluate
@@ -145,6 +146,21 @@ def test_what_a_cell_fine_tunes_is_what_its_column_says(out, cars, reproduced):
         assert row[column]["value"] == pytest.approx(score.mean("psnr"), abs=1e-4)
     values = [row[column]["value"] for column in row if column.startswith("HyperPlanes")]
     assert len(set(values)) == len(values) - 1  # 10 and 100 steps are both 2 at this scale
+
+
+@pytest.mark.parametrize("name", SCALES)
+def test_all_weights_are_fine_tuned_as_by_render_and_the_hypernetwork_as_by_its_source(name, tmp_path):
+    """Source of truth: the defaults, which `render` has, with the rays of the scale; and the scale."""
+    scale, cpu = SCALES[name], torch.device("cpu")
+    runner = Runner(
+        Workspace(tmp_path), DataSets(Workspace(tmp_path), scale, generate=None, device=cpu), train=print, device=cpu
+    )
+    for cell in EXPERIMENTS["cross-class"].cells:
+        found = runner.fine_tuning(cell)
+        if cell.trainable == "weights":
+            assert found == FineTuning(rays=128 if name == "small" else 1024)
+        elif cell.trained.method == "hyperplanes":
+            assert found == scale.fine_tuning
 
 
 def test_every_row_of_an_ablation_is_another_model(reproduced):
