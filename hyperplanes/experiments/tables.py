@@ -30,7 +30,7 @@ SHOWN = (1, 3, 5, 25)
 TARGETS = {"NeRF": "nerf", "MultiPlaneNeRF": "multiplane", "PointMultiPlaneNeRF": "point_multiplane"}
 TUNED = {"HyperPlanes-0": "hyperplanes", "HyperPlanes-10": "hyperplanes_10", "HyperPlanes-100": "hyperplanes_100"}
 WHOLE = "HyperPlanes-100, all weights"
-"""100 steps on theta + delta itself as `render --steps 100` takes them, at `small` with fewer rays; not in the paper."""
+"""100 steps on theta + delta as `render --steps 100` takes them, at `small` with fewer rays; not in the paper."""
 
 
 ALL_READ: Mapping[str, object] = {"model.hypernetwork.views": 25}
