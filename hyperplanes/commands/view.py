@@ -144,12 +144,19 @@ def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
 def _show_others(
     others: Mapping[str, Adapter], shown: Views, viewer: LiveViewer, wanted: queue.SimpleQueue[int], console: Console
 ) -> None:
-    """Shows the other methods one after the other; ends early where another number of views is wanted."""
+    """Shows the other methods one after the other; ends early where another number of views is wanted.
+
+    Of one that does not take so few views it is said why.
+    """
     for name, adapter in others.items():
         if not wanted.empty():
             return
         console.say(f"adapting {name}")
-        viewer.show_other(name, adapter.adapt(shown))
+        try:
+            viewer.show_other(name, adapter.adapt(shown))
+        except ValueError as error:
+            console.warn(f"{name}: {error}")
+            viewer.show_other(name, None, f"{name}: {error}")
 
 
 def _adapt(

@@ -118,7 +118,8 @@ class LiveViewer:
         import viser
 
         self._shown: Shown | None = None
-        self._others: dict[str, Shown] = {}
+        self._others: dict[str, Shown | None] = {}
+        self._notes: dict[str, str] = {}  # of the others
         self._chosen = ALONE
         self._changed, self._stopped = threading.Condition(), False
         self._versions: dict[int, tuple[float, float]] = {}  # of each visitor: last change, and what was drawn of it
@@ -153,18 +154,18 @@ class LiveViewer:
         """
         with self._changed:
             self._shown, self._text = shown, note
-            self._note.content = note
             self._draw_anew()
 
-    def show_other(self, name: str, shown: Shown) -> None:
+    def show_other(self, name: str, shown: Shown | None, note: str = "") -> None:
         """What another method makes of the same views.
 
         Args:
             name: one of `others`.
-            shown: its field.
+            shown: its field; None where it has none, and the left half is the whole picture.
+            note: about it, below that about the field.
         """
         with self._changed:
-            self._others[name] = shown
+            self._others[name], self._notes[name] = shown, note
             self._draw_anew()
 
     def _choose(self, name: str) -> None:
@@ -172,8 +173,13 @@ class LiveViewer:
             self._chosen = name
             self._draw_anew()
 
+    def _notes_shown(self) -> str:
+        """What is noted about the field and the method beside it, as two paragraphs of Markdown."""
+        return "\n\n".join(filter(None, [self._text, self._notes.get(self._chosen)]))
+
     def _draw_anew(self) -> None:
         """For every visitor; called with the lock."""
+        self._note.content = self._notes_shown()
         now = time.monotonic()
         self._versions = {visitor: (now, 0.0) for visitor in self._versions}
         self._changed.notify()
@@ -253,7 +259,7 @@ class LiveViewer:
                 continue
             try:
                 drawn = self._draw_for(client, shown, other, still)
-                note = self._text
+                note = self._notes_shown()
             except Exception as error:  # of one visitor and one picture: the page goes on
                 LOG.exception("a picture of the page could not be drawn")
                 drawn, note = False, f"a picture could not be drawn: {error}"

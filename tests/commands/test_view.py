@@ -27,8 +27,8 @@ class NotingViewer:
     def show(self, shown, note):
         self.notes.append(note)
 
-    def show_other(self, name, shown):
-        self.shown_others.append(name)
+    def show_other(self, name, shown, note=""):
+        self.shown_others.append(name if shown is not None else note)
         if name == self.others[-1]:
             self.all_shown.set()
 
@@ -74,5 +74,21 @@ def test_other_methods_give_way_to_another_number_of_views(monkeypatch):
             return shown
 
     wanted, page = view.queue.SimpleQueue(), NotingViewer(None, 0, None, ["one", "two"])
-    view._show_others({"one": Slow(), "two": Slow()}, None, page, wanted, view.Console(silent=True))
+    view._show_others({"one": Slow(), "two": Slow()}, "views", page, wanted, view.Console(silent=True))
     assert page.shown_others == ["one"]
+
+
+def test_a_method_that_does_not_take_so_few_views_is_noted_and_the_page_goes_on(capfd):
+    class Several:
+        def adapt(self, shown):
+            raise ValueError("support: expected at least 2 views, got 1")
+
+    class Any:
+        def adapt(self, shown):
+            return shown
+
+    page = NotingViewer(None, 0, None, ["scratch_2", "two"])
+    others = {"scratch_2": Several(), "two": Any()}
+    view._show_others(others, "views", page, view.queue.SimpleQueue(), view.Console())
+    assert page.shown_others == ["scratch_2: support: expected at least 2 views, got 1", "two"]
+    assert "scratch_2: support: expected at least 2 views, got 1" in capfd.readouterr().err

@@ -98,7 +98,7 @@ def drawing(visitors, shown):
     page = object.__new__(LiveViewer)
     page._shown, page._others, page._chosen, page._height, page._text = shown, {}, live.ALONE, 48, "25 views"
     page._changed, page._stopped, page._note = threading.Condition(), False, SimpleNamespace(content="25 views")
-    page._versions = {each.client_id: (0.0, 0.0) for each in visitors}
+    page._notes, page._versions = {}, {each.client_id: (0.0, 0.0) for each in visitors}
     page._server = SimpleNamespace(get_clients=lambda: {each.client_id: each for each in visitors})
     worker = threading.Thread(target=page._draw, daemon=True)
     worker.start()
@@ -133,3 +133,13 @@ def test_a_picture_that_fails_is_noted_until_the_next_one(caplog):
         assert visitor.drawn.wait(20)
         assert page._note.content == "26 views"
     assert "out of memory" in caplog.text
+
+
+def test_what_another_method_says_is_noted_while_it_is_chosen():
+    with drawing([], Grey()) as page:
+        page.show_other("scratch_2", None, "scratch_2: expected 2 views")
+        assert page._note.content == "25 views"
+        page._choose("scratch_2")
+        assert page._note.content == "25 views\n\nscratch_2: expected 2 views"
+        page.show_other("scratch_2", Grey())
+        assert page._note.content == "25 views"
