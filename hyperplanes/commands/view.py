@@ -112,6 +112,8 @@ def run(arguments: Arguments) -> int:
             return 0
         number = len(shown)
         while True:
+            for name in others:  # what is shown of it was made of another number of views
+                viewer.show_other(name, None, f"{name}: not adapted yet")
             _adapt(source, shown[:number], arguments, viewer, wanted, console)
             _show_others(others, shown[:number], viewer, wanted, console)
             number = wanted.get()

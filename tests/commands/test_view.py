@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -92,3 +93,23 @@ def test_a_method_that_does_not_take_so_few_views_is_noted_and_the_page_goes_on(
     view._show_others(others, "views", page, view.queue.SimpleQueue(), view.Console())
     assert page.shown_others == ["scratch_2: support: expected at least 2 views, got 1", "two"]
     assert "scratch_2: support: expected at least 2 views, got 1" in capfd.readouterr().err
+
+
+def test_what_was_made_of_another_number_of_views_is_taken_off_the_page(viewer, monkeypatch):
+    class Copied:
+        def adapt(self, shown):
+            return shown
+
+    def adapt(model, shown, arguments, page, wanted, console):
+        page.shown_others.append(len(shown))
+        if len(shown) == 1:
+            raise KeyboardInterrupt
+        page.on_number(1)
+
+    monkeypatch.setattr(view, "load_source", lambda *_, **__: None)
+    monkeypatch.setattr(view, "prepare_task", lambda arguments, task, *_, **__: task)
+    monkeypatch.setattr(view, "_others", lambda *_: {"nearest_view": Copied()})
+    monkeypatch.setattr(view, "_adapt", adapt)
+    assert view.run(view.Arguments(Path("example-car"))) == 0
+    *_, removed, number = viewer.made[0].shown_others
+    assert (removed, number) == ("nearest_view: not adapted yet", 1)
