@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Protocol
 
@@ -41,6 +42,24 @@ class Shown(Protocol):
     def render(self, cameras: PinholeCamera) -> Pictures:
         """The pictures of the cameras."""
         ...
+
+
+@dataclass
+class _Visit:
+    """When a visitor's camera moved or the field changed, when a picture was drawn, and whether no other is due."""
+
+    moved: float
+    drawn: float = 0.0
+    finished: bool = False
+
+    def move(self) -> None:
+        """A picture is due."""
+        self.moved, self.finished = time.monotonic(), False
+
+    @property
+    def due(self) -> float:
+        """When the next picture is: after a move at once, and a larger one when the camera stands still."""
+        return math.inf if self.finished else self.moved + IDLE * (self.drawn >= self.moved)
 
 
 def viewed_camera(
@@ -122,7 +141,7 @@ class LiveViewer:
         self._notes: dict[str, str] = {}  # of the others
         self._chosen = ALONE
         self._changed, self._stopped = threading.Condition(), False
-        self._versions: dict[int, tuple[float, float]] = {}  # of each visitor: last change, and what was drawn of it
+        self._visits: dict[int, _Visit] = {}
         self._height = 96
         self._views = views.to("cpu", torch.float32)
         self._server = viser.ViserServer("127.0.0.1", port, label="HyperPlanes", verbose=False)
@@ -137,6 +156,7 @@ class LiveViewer:
             choice.on_update(lambda _: self._choose(choice.value))
             self._chosen = others[0]
         self._server.on_client_connect(self._welcome)
+        self._server.on_client_disconnect(self._leave)
         self._worker = threading.Thread(target=self._draw, daemon=True)
         self._worker.start()
 
@@ -180,8 +200,8 @@ class LiveViewer:
     def _draw_anew(self) -> None:
         """For every visitor; called with the lock."""
         self._note.content = self._notes_shown()
-        now = time.monotonic()
-        self._versions = {visitor: (now, 0.0) for visitor in self._versions}
+        for visit in self._visits.values():
+            visit.move()
         self._changed.notify()
 
     def stop(self) -> None:
@@ -228,47 +248,53 @@ class LiveViewer:
         client.camera.position = (x, y, z)  # pyright: ignore
         client.camera.look_at = self._views.bounds.centre  # pyright: ignore
 
+        visit = _Visit(time.monotonic())
+
         def moved(_: object) -> None:
             with self._changed:
-                self._versions[client.client_id] = (time.monotonic(), 0.0)  # pyright: ignore
+                visit.move()
                 self._changed.notify()
 
         client.camera.on_update(moved)  # pyright: ignore
-        moved(None)
+        with self._changed:
+            self._visits[client.client_id] = visit  # pyright: ignore
+            self._changed.notify()
+
+    def _leave(self, client: object) -> None:
+        with self._changed:
+            self._visits.pop(client.client_id, None)  # pyright: ignore
 
     def _draw(self) -> None:
         """Draws for each visitor whose camera moved, and once more, larger, when it stands still."""
         while True:
             with self._changed:
-                waiting = [(visitor, *times) for visitor, times in self._versions.items() if times[1] < math.inf]
                 if self._stopped:
                     return
-                if self._shown is None or not waiting:
-                    self._changed.wait()
+                soonest = min((visit.due for visit in self._visits.values()), default=math.inf)
+                now = time.monotonic()
+                if self._shown is None or soonest > now:
+                    self._changed.wait(None if self._shown is None or soonest == math.inf else soonest - now)
                     continue
-                shown, other, now = self._shown, self._others.get(self._chosen), time.monotonic()
-                visitor, moved, drawn = min(waiting, key=lambda each: each[2])
-                still = drawn >= moved
-                if still and now - moved < IDLE:
-                    self._changed.wait(IDLE - (now - moved))
+                # of those who wait the one whose last picture is oldest
+                waiting = [(visit.drawn, visitor) for visitor, visit in self._visits.items() if visit.due <= now]
+                _, visitor = min(waiting)
+                client = self._server.get_clients().get(visitor)
+                if client is None:  # gone before it was welcomed
+                    del self._visits[visitor]
                     continue
-                self._versions[visitor] = (moved, math.inf if still else now)
-            client = self._server.get_clients().get(visitor)
-            if client is None:
-                self._versions.pop(visitor, None)
-                continue
+                shown, other, visit = self._shown, self._others.get(self._chosen), self._visits[visitor]
+                moved, still = visit.moved, visit.drawn >= visit.moved
+                visit.drawn, visit.finished = now, still
             try:
-                drawn = self._draw_for(client, shown, other, still)
-                note = self._notes_shown()
+                drawn, failure = self._draw_for(client, shown, other, still), ""
             except Exception as error:  # of one visitor and one picture: the page goes on
                 LOG.exception("a picture of the page could not be drawn")
-                drawn, note = False, f"a picture could not be drawn: {error}"
+                drawn, failure = False, f"a picture could not be drawn: {error}"
             with self._changed:
-                if self._note.content != note:
+                if self._note.content != (note := failure or self._notes_shown()):
                     self._note.content = note
                 # not again until the camera moves or the field changes
-                if not drawn and self._versions.get(visitor, (0.0, 0.0))[0] == moved:
-                    self._versions[visitor] = (moved, math.inf)
+                visit.finished = visit.finished or (not drawn and visit.moved == moved)
 
     def _draw_for(self, client: object, shown: Shown, other: Shown | None, still: bool) -> bool:
         """One picture for one visitor; False where the visitor's page has no size.

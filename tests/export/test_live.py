@@ -98,7 +98,7 @@ def drawing(visitors, shown):
     page = object.__new__(LiveViewer)
     page._shown, page._others, page._chosen, page._height, page._text = shown, {}, live.ALONE, 48, "25 views"
     page._changed, page._stopped, page._note = threading.Condition(), False, SimpleNamespace(content="25 views")
-    page._notes, page._versions = {}, {each.client_id: (0.0, 0.0) for each in visitors}
+    page._notes, page._visits = {}, {each.client_id: live._Visit(time.monotonic()) for each in visitors}
     page._server = SimpleNamespace(get_clients=lambda: {each.client_id: each for each in visitors})
     worker = threading.Thread(target=page._draw, daemon=True)
     worker.start()
@@ -143,3 +143,35 @@ def test_what_another_method_says_is_noted_while_it_is_chosen():
         assert page._note.content == "25 views\n\nscratch_2: expected 2 views"
         page.show_other("scratch_2", Grey())
         assert page._note.content == "25 views"
+
+
+def test_a_visitor_who_drags_does_not_keep_others_waiting():
+    class Slow(Grey):
+        def render(self, cameras):
+            with page._changed:  # the camera moved again while the picture was drawn
+                page._visits[first.client_id].move()
+            return super().render(cameras)
+
+    first, second = Visitor(1.5), Visitor(1.5)
+    with drawing([first, second], None) as page:
+        page.show(Slow(), "25 views")
+        assert second.drawn.wait(20)
+        second.drawn.clear()
+        with page._changed:
+            page._visits[second.client_id].move()
+        before = first.pictures
+        assert second.drawn.wait(20)
+        assert first.pictures <= before + 2
+
+
+def test_a_visitor_who_has_gone_is_forgotten():
+    stays, leaves = Visitor(1.5), Visitor(1.5)
+    with drawing([stays, leaves], Grey()) as page:
+        page._server.get_clients = lambda: {stays.client_id: stays}
+        page.show(Grey(), "26 views")
+        deadline = time.monotonic() + 20
+        while leaves.client_id in page._visits and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert list(page._visits) == [stays.client_id]
+        page._leave(stays)
+        assert not page._visits
