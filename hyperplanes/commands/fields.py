@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
-    from hyperplanes.commands.console import Console
+    from hyperplanes.commands.console import Bar, Console
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.fields.baked import BakedField
@@ -191,7 +191,15 @@ def render_views(
     return join_pictures(parts)
 
 
-def bake_field(field: AdaptedField, shown: Views, side: int, *, fit: int, console: Console) -> BakedField:
+def bake_field(
+    field: AdaptedField,
+    shown: Views,
+    side: int,
+    *,
+    fit: int,
+    console: Console,
+    check: Callable[[], None] = lambda: None,
+) -> BakedField:
     """The voxels of a field, fitted to the views that it was adapted to, with progress lines.
 
     Args:
@@ -200,19 +208,24 @@ def bake_field(field: AdaptedField, shown: Views, side: int, *, fit: int, consol
         side: voxels an axis.
         fit: gradient steps on the views; 0 keeps the field's own colours and densities.
         console: where the progress is shown, and at the end what it cost.
+        check: called now and then; what it raises ends the work.
     """
     from hyperplanes.export.baking import bake
     from hyperplanes.export.voxel_fitting import fit_voxels, render_guide
 
+    def show(bar: Bar, done: int, total: int, text: str) -> None:
+        check()
+        bar.show(done, total, text)
+
     started = time.perf_counter()
     with console.bar("baking") as bar:
-        baked = bake(field, side=side, on_part=lambda done, total: bar.show(done, total, "voxels"))
+        baked = bake(field, side=side, on_part=lambda done, total: show(bar, done, total, "voxels"))
     between = time.perf_counter()
     how = f"{len(baked.values):,} voxels of {side}^3 baked in {format_duration(between - started)}"
     if fit:
         with console.bar("fitting voxels") as bar:
             guide = render_guide(field, shown)
-            baked = fit_voxels(baked, shown, guide=guide, steps=fit, on_step=lambda done: bar.show(done, fit, "steps"))
+            baked = fit_voxels(baked, shown, guide=guide, steps=fit, on_step=lambda done: show(bar, done, fit, "steps"))
         how += f", fitted to {len(shown)} views in {format_duration(time.perf_counter() - between)}"
     console.say(how)
     return baked

@@ -18,7 +18,9 @@ from __future__ import annotations
 import queue
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -114,8 +116,9 @@ def run(arguments: Arguments) -> int:
         while True:
             for name in others:  # what is shown of it was made of another number of views
                 viewer.show_other(name, None, f"{name}: not adapted yet")
-            _adapt(source, shown[:number], arguments, viewer, wanted, console)
-            _show_others(others, shown[:number], viewer, wanted, console)
+            with suppress(_Superseded):
+                _adapt(source, shown[:number], arguments, viewer, wanted, console)
+                _show_others(others, shown[:number], viewer, wanted, console)
             number = wanted.get()
             while not wanted.empty():
                 number = wanted.get()
@@ -143,16 +146,25 @@ def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
     }
 
 
+class _Superseded(Exception):
+    """Another number of views is wanted."""
+
+
+def _check(wanted: queue.SimpleQueue[int]) -> None:
+    """End what is made of a number of views where another is wanted."""
+    if not wanted.empty():
+        raise _Superseded
+
+
 def _show_others(
     others: Mapping[str, Adapter], shown: Views, viewer: LiveViewer, wanted: queue.SimpleQueue[int], console: Console
 ) -> None:
-    """Shows the other methods one after the other; ends early where another number of views is wanted.
+    """Shows the other methods one after the other.
 
     Of one that does not take so few views it is said why.
     """
     for name, adapter in others.items():
-        if not wanted.empty():
-            return
+        _check(wanted)
         console.say(f"adapting {name}")
         try:
             viewer.show_other(name, adapter.adapt(shown))
@@ -169,7 +181,7 @@ def _adapt(
     wanted: queue.SimpleQueue[int],
     console: Console,
 ) -> None:
-    """Shows the field as it is adapted, fine-tuned and baked; ends early where another number of views is wanted."""
+    """Shows the field as it is adapted, fine-tuned and baked."""
     import torch
 
     from hyperplanes.adaptation.canonical_frame import to_canonical_frame
@@ -190,8 +202,8 @@ def _adapt(
                 weights = Parameters((name, value.clone()) for name, value in variables.weights().items())
             field = placed.in_scene(tuned_field(model, context, weights) if steps else model.adapt_to(context))
             viewer.show(field, f"{len(shown)} support views, {done} of {steps} fine-tuning steps")
-        if not wanted.empty():
-            return
+        _check(wanted)
     if arguments.fit and field is not None:
-        baked = bake_field(field, shown, default_side(shown.size), fit=arguments.fit, console=console)
+        side, check = default_side(shown.size), partial(_check, wanted)
+        baked = bake_field(field, shown, side, fit=arguments.fit, console=console, check=check)
         viewer.show(BakedScene(baked), f"{len(shown)} support views, {steps} steps, {len(baked.values):,} baked voxels")

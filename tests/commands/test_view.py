@@ -5,12 +5,13 @@ import signal
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hyperplanes.cli import main
 from hyperplanes.commands import view
-from hyperplanes.export import live
+from hyperplanes.export import baking, live, voxel_fitting
 
 
 class NotingViewer:
@@ -75,7 +76,8 @@ def test_other_methods_give_way_to_another_number_of_views(monkeypatch):
             return shown
 
     wanted, page = view.queue.SimpleQueue(), NotingViewer(None, 0, None, ["one", "two"])
-    view._show_others({"one": Slow(), "two": Slow()}, "views", page, wanted, view.Console(silent=True))
+    with pytest.raises(view._Superseded):
+        view._show_others({"one": Slow(), "two": Slow()}, "views", page, wanted, view.Console(silent=True))
     assert page.shown_others == ["one"]
 
 
@@ -113,3 +115,30 @@ def test_what_was_made_of_another_number_of_views_is_taken_off_the_page(viewer, 
     assert view.run(view.Arguments(Path("example-car"))) == 0
     *_, removed, number = viewer.made[0].shown_others
     assert (removed, number) == ("nearest_view: not adapted yet", 1)
+
+
+@pytest.mark.parametrize("part", ["baking", "fitting"])
+def test_voxels_give_way_to_another_number_of_views(part, monkeypatch):
+    def move(title, done):
+        told.append(title)
+        if title == part and done == 2:
+            wanted.put(2)  # somebody moves the slider meanwhile
+
+    def bake(field, side, on_part):
+        for done in range(1, 5):
+            move("baking", done)
+            on_part(done, 4)
+        return SimpleNamespace(values=())
+
+    def fit_voxels(baked, shown, guide, steps, on_step):
+        for done in range(1, 1 + steps):
+            move("fitting", done)
+            on_step(done)
+
+    wanted, told, silent = view.queue.SimpleQueue(), [], view.Console(silent=True)
+    monkeypatch.setattr(baking, "bake", bake)
+    monkeypatch.setattr(voxel_fitting, "fit_voxels", fit_voxels)
+    monkeypatch.setattr(voxel_fitting, "render_guide", lambda *_: None)
+    with pytest.raises(view._Superseded):
+        view.bake_field(None, [], 8, fit=9, console=silent, check=lambda: view._check(wanted))
+    assert told == {"baking": ["baking"] * 2, "fitting": ["baking"] * 4 + ["fitting"] * 2}[part]
