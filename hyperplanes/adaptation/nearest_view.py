@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+from torch.nn.functional import grid_sample, interpolate
 
 from hyperplanes.adaptation.base import Pictures
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
@@ -22,7 +26,8 @@ class _Copies:
     def render(self, cameras: PinholeCamera) -> Pictures:
         """The support image whose camera stands in the most similar direction from the scene's centre.
 
-        Its mask is the opacity; without masks all that is in a picture counts as there. Depth is not known: 0.
+        Its mask is the opacity; without masks all that is in a picture counts as there. Through another lens, what the
+        copied picture does not show is white, with opacity 0. Depth is not known: 0.
         """
         known, asked = (
             camera.camera_directions(each, self.support.bounds.centre).to(self.support.images)
@@ -32,10 +37,41 @@ class _Copies:
         masks = self.support.masks
         opacity = torch.ones_like(self.support.images[nearest, :1]) if masks is None else masks[nearest]
         copied = torch.cat([self.support.images[nearest], opacity], 1)
-        size = camera.image_size(cameras)
-        if size != self.support.size:
-            copied = torch.nn.functional.interpolate(copied, size, mode="bilinear", antialias=True)
+        parts = [
+            _through(copied[[view]], camera.select(self.support.cameras, [source]), camera.select(cameras, [view]))
+            for view, source in enumerate(nearest.tolist())
+        ]
+        copied = torch.cat(parts)
         return Pictures(copied[:, :3], copied[:, 3:], torch.zeros_like(copied[:, 3:]), 0)
+
+
+def _through(
+    copied: Float[Tensor, "1 4 height width"], lens: PinholeCamera, asked: PinholeCamera
+) -> Float[Tensor, "1 4 asked_height asked_width"]:
+    """Colours and opacity as another camera would show them from the same place, by bilinear interpolation."""
+    (height, width), size = camera.image_size(asked), camera.image_size(lens)
+    if (height, width) == size and torch.equal(_calibration(asked).to(copied), _calibration(lens).to(copied)):
+        return copied
+    # where the picture has what each pixel looks at
+    still = torch.eye(4).to(asked.extrinsics)[None]
+    y, x = torch.meshgrid(*(torch.arange(each).to(asked.extrinsics) for each in (height, width)), indexing="ij")
+    pixels = torch.stack([x, y], -1).reshape(1, -1, 2)
+    points = camera.with_poses(asked, still).unproject(pixels, torch.ones_like(pixels[..., :1]))
+    found = camera.with_poses(lens, still.to(lens.extrinsics)).project(points.to(lens.extrinsics)).to(copied)
+    # a picture of more pixels is reduced first, averaging
+    scale = float((camera.intrinsics(asked).to(copied) / camera.intrinsics(lens).to(copied))[0, [0, 1], [0, 1]].mean())
+    if scale < 1:
+        copied = interpolate(copied, [max(1, round(scale * side)) for side in size], mode="bilinear", antialias=True)
+    # from -1 to 1 between the borders of the first and the last pixel
+    grid = (2 * found + 1) / found.new_tensor([size[1], size[0]]) - 1
+    inside = (grid.abs() <= 1).all(-1).reshape(1, 1, height, width)
+    shown = grid_sample(copied, grid.reshape(1, height, width, 2), padding_mode="border", align_corners=False)
+    return torch.where(inside, shown, shown.new_tensor([1, 1, 1, 0]).reshape(4, 1, 1))
+
+
+def _calibration(cameras: PinholeCamera) -> Tensor:
+    matrix = camera.intrinsics(cameras).flatten(1)
+    return torch.cat([matrix, cameras.distortion], 1) if isinstance(cameras, DistortedCamera) else matrix
 
 
 class NearestView:

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import NearestView
-from hyperplanes.geometry.cameras import concatenate, select
+from hyperplanes.geometry.cameras import concatenate, pinhole, resized, select
+from hyperplanes.geometry.distortion import distorted
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Views
 from tests.reference_rendering import ball_views, camera_at, ring
@@ -45,11 +46,61 @@ def test_a_distance_does_not_matter():
     assert torch.equal(picture[0], views.images[expected])
 
 
-def test_images_of_another_size_are_scaled():
-    views = Views(torch.full((2, 3, 12, 16), 0.25), ring(2, (12, 16)))
-    pictures = NearestView().adapt(views).render(ring(1, (24, 20)))
-    assert pictures.images.shape == (1, 3, 24, 20)
-    torch.testing.assert_close(pictures.images, torch.full((1, 3, 24, 20), 0.25))
+def seen(views, focal, middle, size):
+    """What is copied for the first camera with another lens."""
+    matrix = torch.tensor([[focal[0], 0, middle[0]], [0, focal[1], middle[1]], [0, 0, 1.0]])
+    asked = pinhole(matrix, views.cameras.extrinsics[:1], *size)
+    return NearestView().adapt(views).render(asked)
+
+
+def test_a_page_of_another_aspect_shows_more_and_stretches_nothing():
+    # a lens of the same focal length whose picture is 4 columns wider and 3 rows lower, one of them above
+    views = support()
+    (fx, fy), (cx, cy) = views.cameras.intrinsics[0, [0, 1], [0, 1]], views.cameras.intrinsics[0, :2, 2]
+    found = seen(views, (fx, fy), (cx + 2, cy - 1), (9, 20))
+    torch.testing.assert_close(found.images[0, :, :, 2:18], views.images[0, :, 1:10], atol=1e-4, rtol=0)
+    for edge in (slice(0, 2), slice(18, 20)):
+        assert (found.images[0, :, :, edge] == 1).all()
+        assert (found.opacity[0, :, :, edge] == 0).all()
+    assert (found.opacity[0, :, :, 2:18] == 1).all()
+
+
+def test_a_longer_lens_shows_the_middle_by_bilinear_interpolation():
+    # u of the asked camera is (u - 4) / 2 + 7.5 of the copy, v likewise: every other one lies between two pixels
+    views = support()
+    fx, fy = views.cameras.intrinsics[0, [0, 1], [0, 1]]
+    found = seen(views, (2 * fx, 2 * fy), (4.0, 4.0), (9, 9)).images[0]
+    pixels = views.images[0]
+    between = (pixels[:, 5, 7] + pixels[:, 5, 8] + pixels[:, 6, 7] + pixels[:, 6, 8]) / 4
+    torch.testing.assert_close(found[:, 4, 4], between, atol=1e-4, rtol=0)  # (7.5, 5.5)
+    torch.testing.assert_close(found[:, 3, 5], pixels[:, 5, 8], atol=1e-4, rtol=0)
+
+
+def test_fewer_pixels_are_means():
+    # black and white columns in turn are grey, away from the borders, and the whole picture is seen
+    views = Views(torch.arange(2).repeat(8).expand(1, 3, 16, 16).float(), ring(1, (16, 16)))
+    small = NearestView().adapt(views).render(resized(views.cameras, 4, 4))
+    torch.testing.assert_close(small.images[..., 1:3], torch.full((1, 3, 4, 2), 0.5), atol=0.02, rtol=0)
+    torch.testing.assert_close(small.opacity, torch.ones(1, 1, 4, 4))
+
+
+def test_a_distorted_lens_moves_pixels_as_opencv_does():
+    views = support()
+    (fx, fy), (cx, cy) = views.cameras.intrinsics[0, [0, 1], [0, 1]], views.cameras.intrinsics[0, :2, 2]
+    bent = distorted(select(views.cameras, [0]), torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0]))
+    one = Views(views.images[:1], bent)
+    assert torch.equal(NearestView().adapt(one).render(bent).images, one.images)
+    found = seen(one, (fx, fy), (cx, cy), (12, 16)).images[0]
+    # pixel (7, 3) of the straight lens: (-0.5 / fx, -2.5 / fy) times 1 + k1 r^2 in the copy
+    x, y = -0.5 / fx, -2.5 / fy
+    factor = 1 + 0.1 * (x * x + y * y)
+    u, v = factor * x * fx + cx, factor * y * fy + cy
+    left, top = int(u), int(v)
+    a, b = u - left, v - top
+    square = one.images[0, :, top : top + 2, left : left + 2]
+    expected = (1 - b) * ((1 - a) * square[:, 0, 0] + a * square[:, 0, 1])
+    expected = expected + b * ((1 - a) * square[:, 1, 0] + a * square[:, 1, 1])
+    torch.testing.assert_close(found[:, 3, 7], expected, atol=1e-4, rtol=0)
 
 
 def test_the_opacity_is_the_mask_of_the_copied_view_and_one_without_masks():
