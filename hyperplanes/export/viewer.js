@@ -288,12 +288,15 @@ window.showVoxels ||= (() => {
   function control(canvas, orbit, changed) {
     const fingers = new Map();
     const spread = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
+    const release = (event) => fingers.delete(event.pointerId);
     canvas.addEventListener("pointerdown", (event) => {
+      if (event.button) return;
       canvas.setPointerCapture(event.pointerId);
       fingers.set(event.pointerId, [event.clientX, event.clientY]);
       changed();
     });
     canvas.addEventListener("pointermove", (event) => {
+      if (!(event.buttons & 1)) release(event); // somewhere else, which nobody told the page
       const before = fingers.get(event.pointerId);
       if (!before) return;
       const apart = fingers.size === 2 && spread();
@@ -304,8 +307,7 @@ window.showVoxels ||= (() => {
       } else if (apart && spread()) orbit.zoom(apart / spread());
       changed();
     });
-    for (const kind of ["pointerup", "pointercancel"])
-      canvas.addEventListener(kind, (event) => fingers.delete(event.pointerId));
+    for (const kind of ["pointerup", "pointercancel", "lostpointercapture"]) canvas.addEventListener(kind, release);
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
       orbit.zoom(Math.exp(event.deltaY * (event.deltaMode ? 0.03 : 0.001)));

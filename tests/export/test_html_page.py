@@ -56,6 +56,13 @@ def baked():
     return bake(AdaptedField(two_balls, full(SPHERE, 32), RayMarching(96)), side=64)
 
 
+@pytest.fixture(scope="module")
+def small(views):
+    """The fragment of a page that is quick to draw."""
+    tiny = bake(AdaptedField(two_balls, full(SPHERE, 8), RayMarching(16)), side=8)
+    return page_of(tiny, views, picture=turning_picture(tiny, views, frames=1, size=8))
+
+
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
 def test_the_page_shows_what_the_baked_form_shows(baked, views, tmp_path):
     page = save_page(page_of(baked, views), tmp_path / "page.html", "Two <balls>")
@@ -119,28 +126,10 @@ class Listener(BaseHTTPRequestHandler):
 
 
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_of_many_viewers_twelve_draw_and_what_is_tapped_or_lost_comes_back(views, tmp_path):
-    small = bake(AdaptedField(two_balls, full(SPHERE, 8), RayMarching(16)), side=8)
-    fragment = page_of(small, views, picture=turning_picture(small, views, frames=1, size=8))
-    boxes = [f'<div style="width:40px;float:left">{fragment}</div>' for _ in range(18)]
+def test_of_many_viewers_twelve_draw_and_what_is_tapped_or_lost_comes_back(small, tmp_path):
+    boxes = [f'<div style="width:40px;float:left">{small}</div>' for _ in range(18)]
     page = save_page("\n".join([*boxes, f"<script>{STORY}</script>"]), tmp_path / "page.html", "many")
-    listener = type("Heard", (Listener,), {"page": page.read_bytes()})
-    flags = [each for each in FLAGS if not each.startswith("--virtual-time")]
-    with ThreadingHTTPServer(("127.0.0.1", 0), listener) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        command = [str(chromium), *flags, f"--user-data-dir={tmp_path / 'profile'}", "--remote-debugging-port=0"]
-        address = f"http://127.0.0.1:{server.server_port}/"
-        browser = subprocess.Popen([*command, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            deadline = time.monotonic() + 120
-            while listener.told is None and listener.loads < 3 and time.monotonic() < deadline:
-                time.sleep(0.05)
-        finally:
-            browser.terminate()
-            browser.wait(20)
-            server.shutdown()
-    assert listener.told is not None, "the page told nothing"
-    told = listener.told.split(", ")
+    told, loads = heard(page, tmp_path, 3)
     states = dict(each.split(" ") for each in told if "focus" not in each)
     assert states["loaded"] == states["again"] == "v" * 12 + "p" * 6
     assert states["lost"] == "p" + "v" * 11 + "p" * 6
@@ -148,7 +137,88 @@ def test_of_many_viewers_twelve_draw_and_what_is_tapped_or_lost_comes_back(views
     assert states["tapped"][13] == "v"
     assert states["removed"][12] == "v"
     assert "focused" in told
-    assert listener.loads == 1
+    assert loads == 1
+
+
+def heard(page, folder, most):
+    """What a page tells in a browser, part by part, and how many times it is loaded; it is closed after so many."""
+    listener = type("Heard", (Listener,), {"page": page.read_bytes()})
+    flags = [each for each in FLAGS if not each.startswith("--virtual-time")]
+    with ThreadingHTTPServer(("127.0.0.1", 0), listener) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        command = [str(chromium), *flags, f"--user-data-dir={folder / 'profile'}", "--remote-debugging-port=0"]
+        address = f"http://127.0.0.1:{server.server_port}/"
+        browser = subprocess.Popen([*command, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            deadline = time.monotonic() + 120
+            while listener.told is None and listener.loads < most and time.monotonic() < deadline:
+                time.sleep(0.05)
+        finally:
+            browser.terminate()
+            browser.wait(20)
+            server.shutdown()
+    assert listener.told is not None, "the page told nothing"
+    return listener.told.split(", "), listener.loads
+
+
+INPUT = """
+let eye = "";
+const set = WebGL2RenderingContext.prototype.uniform3f;
+WebGL2RenderingContext.prototype.uniform3f = function (place, ...values) {
+  eye = values.join();
+  set.call(this, place, ...values);
+};
+const frames = async () => { for (let n = 0; n < 3; n++) await new Promise(requestAnimationFrame); };
+const told = [], box = document.querySelector(".voxels");
+(async () => {
+  while (box.dataset.shown !== "voxels") await new Promise((done) => setTimeout(done, 100));
+  const canvas = box.querySelector("canvas");
+  canvas.setPointerCapture = () => {}; // of pointers that are none
+  const send = (kind, clientX, more) =>
+    canvas.dispatchEvent(new PointerEvent(kind, { clientX, clientY: 20, pointerId: 1, bubbles: true, ...more }));
+  const moves = async (name, action) => {
+    await frames();
+    const before = eye;
+    action();
+    await frames();
+    told.push(`${name} ${eye === before ? "stays" : "moves"}`);
+  };
+  send("pointerdown", 10, { buttons: 1 });
+  send("pointerup", 10); // it no longer turns by itself
+  await moves("hover", () => send("pointermove", 40, { buttons: 0 }));
+  await moves("drag", () => {
+    send("pointerdown", 10, { buttons: 1 });
+    send("pointermove", 40, { buttons: 1 });
+  });
+  await moves("release-unseen", () => send("pointermove", 70, { buttons: 0 }));
+  await moves("move-after", () => send("pointermove", 90, { buttons: 1 }));
+  await moves("right", () => {
+    send("pointerdown", 10, { button: 2, buttons: 2 });
+    send("pointermove", 40, { buttons: 2 });
+  });
+  send("pointerdown", 10, { buttons: 1 });
+  send("lostpointercapture", 10);
+  await moves("capture-lost", () => send("pointermove", 40, { buttons: 1 }));
+  for (const pointerId of [2, 3]) send("pointerdown", 10 * pointerId, { pointerId, buttons: 1 });
+  await moves("two-fingers", () => send("pointermove", 40, { pointerId: 3, buttons: 1 }));
+  fetch("/told", { method: "POST", body: told.join(", ") });
+})();
+"""
+
+
+@pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
+def test_the_object_turns_while_the_first_button_is_held(small, tmp_path):
+    told, _ = heard(save_page(f"{small}<script>{INPUT}</script>", tmp_path / "page.html", "one"), tmp_path, 3)
+    found = dict(each.split(" ") for each in told)
+    assert found == {
+        "hover": "stays",
+        "drag": "moves",
+        "release-unseen": "stays",
+        "move-after": "stays",
+        "right": "stays",
+        "capture-lost": "stays",
+        "two-fingers": "moves",
+    }
 
 
 def test_a_page_is_one_file_that_asks_for_nothing(baked, views, tmp_path):
