@@ -315,6 +315,7 @@ window.showVoxels ||= (() => {
     }, { passive: false });
     canvas.addEventListener("dblclick", () => { orbit.reset(); changed(); });
     canvas.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return; // the browser's
       const turns = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
       if (turns[event.key]) orbit.turn(...turns[event.key]);
       else if (event.key === "+" || event.key === "-") orbit.zoom(event.key === "+" ? 0.9 : 1 / 0.9);

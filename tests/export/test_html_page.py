@@ -201,13 +201,18 @@ const told = [], box = document.querySelector(".voxels");
   await moves("capture-lost", () => send("pointermove", 40, { buttons: 1 }));
   for (const pointerId of [2, 3]) send("pointerdown", 10 * pointerId, { pointerId, buttons: 1 });
   await moves("two-fingers", () => send("pointermove", 40, { pointerId: 3, buttons: 1 }));
+  for (const modifier of ["none", "ctrlKey", "metaKey", "altKey"]) for (const key of ["+", "ArrowLeft"]) {
+    const event = new KeyboardEvent("keydown", { key, cancelable: true, [modifier]: true });
+    await moves(`${modifier}${key}`, () => canvas.dispatchEvent(event));
+    if (event.defaultPrevented !== (modifier === "none")) told.push("taken-from-the-browser " + modifier + key);
+  }
   fetch("/told", { method: "POST", body: told.join(", ") });
 })();
 """
 
 
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_the_object_turns_while_the_first_button_is_held(small, tmp_path):
+def test_the_object_turns_by_the_first_button_and_by_keys_of_its_own(small, tmp_path):
     told, _ = heard(save_page(f"{small}<script>{INPUT}</script>", tmp_path / "page.html", "one"), tmp_path, 3)
     found = dict(each.split(" ") for each in told)
     assert found == {
@@ -218,6 +223,8 @@ def test_the_object_turns_while_the_first_button_is_held(small, tmp_path):
         "right": "stays",
         "capture-lost": "stays",
         "two-fingers": "moves",
+        **dict.fromkeys(["none+", "noneArrowLeft"], "moves"),
+        **dict.fromkeys([f"{each}Key{key}" for each in ("ctrl", "meta", "alt") for key in ("+", "ArrowLeft")], "stays"),
     }
 
 
