@@ -277,13 +277,20 @@ window.showVoxels ||= (() => {
   }
 
   // A camera of the address: #camera=12 numbers of camera_from_world,fx,fy,cx,cy,width,height
+  const CAMERA = /[#&]camera=([^&]*)/, LARGEST = 4096; // pixels of a side
   function addressed() {
-    const match = /[#&]camera=([^&]*)/.exec(location.hash), numbers = match && match[1].split(",").map(Number);
+    const match = CAMERA.exec(location.hash), numbers = match && match[1].split(",").map(Number);
     if (!numbers || numbers.length !== 18 || !numbers.every(Number.isFinite)) return null;
+    if (!numbers[12] || !numbers[13]) return null;
+    if (!numbers.slice(16).every((side) => Number.isInteger(side) && side >= 1 && side <= LARGEST)) return null;
     const rows = [0, 4, 8].map((at) => numbers.slice(at, at + 3)), shift = [3, 7, 11].map((at) => numbers[at]);
     const eye = [0, 1, 2].map((axis) => -rows.reduce((sum, row, n) => sum + row[axis] * shift[n], 0));
     return { rows, eye, lens: numbers.slice(12, 16), width: numbers[16], height: numbers[17] };
   }
+
+  addEventListener("hashchange", ({ oldURL, newURL }) => {
+    if (CAMERA.test(oldURL) || CAMERA.test(newURL)) location.reload();
+  });
 
   function control(canvas, orbit, changed) {
     const fingers = new Map();
