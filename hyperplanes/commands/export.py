@@ -100,7 +100,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, save_images, to_pixels
     from hyperplanes.export.mesh import check_voxels
     from hyperplanes.export.page import page_of, save_page, turning_picture
-    from hyperplanes.utilities.errors import prefix_errors, rename_errors
+    from hyperplanes.utilities.errors import rename_errors
     from hyperplanes.utilities.writing import write_whole
 
     if not arguments.what:
@@ -112,10 +112,10 @@ def run(arguments: Arguments) -> int:
     if arguments.level is not None and not arguments.level > 0:
         raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")
     if "mesh" in arguments.what:
-        with prefix_errors("--voxels"):
+        with rename_errors("voxels", "--voxels"):
             check_voxels(arguments.voxels)
     if arguments.page_voxels is not None:
-        with prefix_errors("--page-voxels"):
+        with rename_errors("side", "--page-voxels"):
             coarsening(arguments.page_voxels)
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+from urllib.parse import urlsplit
 
 import tyro
 
@@ -105,6 +106,8 @@ def run(arguments: Arguments) -> int:
     baked = isinstance(source, BakedScene)
     others = _others(arguments, device)
     viewer = LiveViewer(shown, arguments.port, None if baked else wanted.put, list(others))
+    if arguments.port not in (0, urlsplit(viewer.address).port):
+        console.warn(f"--port: {arguments.port} is taken, and the next that is free is used")
     console.say(f"{viewer.address}: open it in a browser; Ctrl-C ends it")
     try:
         if isinstance(source, BakedScene):
@@ -122,8 +125,8 @@ def run(arguments: Arguments) -> int:
             number = wanted.get()
             while not wanted.empty():
                 number = wanted.get()
-    except Terminated:
-        raise
+    except Terminated as end:
+        raise type(end)("the page is closed") from end
     except KeyboardInterrupt:
         console.say("ended")
     finally:

@@ -147,10 +147,15 @@ class LiveViewer:
         self._server = viser.ViserServer("127.0.0.1", port, label="HyperPlanes", verbose=False)
         self._server.scene.set_up_direction(upward(self._views.cameras))
         self._note, self._text = self._server.gui.add_markdown(""), ""
-        self._add_frusta()
+        show_frusta = self._add_frusta()
         if on_number is not None:
             slider = self._server.gui.add_slider("support views", 1, len(views), 1, len(views))
-            slider.on_update(lambda _: on_number(int(slider.value)))
+
+            @slider.on_update
+            def _(_: object) -> None:
+                show_frusta(int(slider.value))
+                on_number(int(slider.value))
+
         if others:
             choice = self._server.gui.add_dropdown("on the right", (ALONE, *others), initial_value=others[0])
             choice.on_update(lambda _: self._choose(choice.value))
@@ -212,7 +217,8 @@ class LiveViewer:
         self._worker.join(10)
         self._server.stop()
 
-    def _add_frusta(self) -> None:
+    def _add_frusta(self) -> Callable[[int], None]:
+        """Adds those of all views; returns what shows those of the first ones alone."""
         cameras = self._views.cameras
         height, width = camera.image_size(cameras)
         every = max(1, max(height, width) // THUMBNAIL)
@@ -234,12 +240,16 @@ class LiveViewer:
                     position=tuple(place),
                 )
             )
-        switch = self._server.gui.add_checkbox("photographs", True)
+        switch, number = self._server.gui.add_checkbox("photographs", True), len(frusta)
 
-        @switch.on_update
-        def _(_: object) -> None:
-            for frustum in frusta:
-                frustum.visible = switch.value
+        def show(first: int) -> None:
+            nonlocal number
+            number = first
+            for view, frustum in enumerate(frusta):
+                frustum.visible = switch.value and view < number
+
+        switch.on_update(lambda _: show(number))
+        return show
 
     def _welcome(self, client: object) -> None:
         start = orbit_cameras(self._views, 1)

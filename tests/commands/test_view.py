@@ -47,7 +47,7 @@ def viewer(monkeypatch):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
-def test_ctrl_c_is_how_a_page_ends_and_a_termination_says_so(number, code, viewer, monkeypatch):
+def test_ctrl_c_is_how_a_page_ends_and_a_termination_says_so(number, code, viewer, monkeypatch, capfd):
     monkeypatch.setattr(view, "load_source", lambda *_, **__: None)
 
     rounds = []
@@ -67,6 +67,10 @@ def test_ctrl_c_is_how_a_page_ends_and_a_termination_says_so(number, code, viewe
     monkeypatch.setattr(view, "prepare_task", lambda arguments, task, *_, **__: task)
     assert main(["view", "example-car", "--fit", "0"]) == code
     assert viewer.made[0].stopped
+    errors = capfd.readouterr().err
+    assert "goes on where it can" not in errors
+    assert "--port: 8080 is taken" in errors  # the page has another
+    assert ("terminated; the page is closed" in errors) == (code == 143)
 
 
 def test_other_methods_give_way_to_another_number_of_views(monkeypatch):

@@ -1,6 +1,7 @@
 """The page by viser. Source of truth: our own cameras, and a client's messages counted through viser's interface."""
 
 import math
+import sys
 import threading
 import time
 import urllib.request
@@ -175,3 +176,32 @@ def test_a_visitor_who_has_gone_is_forgotten():
         assert list(page._visits) == [stays.client_id]
         page._leave(stays)
         assert not page._visits
+
+
+def test_frusta_are_those_of_the_number_of_views_and_of_the_switch(monkeypatch):
+    class Handle(SimpleNamespace):
+        visible = True
+
+        def on_update(self, callback):
+            self.move = callback
+
+    def add(name, *values, **_):
+        made[name] = Handle(value=values[-1] if values else None)
+        return made[name]
+
+    gui = SimpleNamespace(add_markdown=add, add_checkbox=add, add_slider=add)
+    scene = SimpleNamespace(add_camera_frustum=add, set_up_direction=lambda _: None)
+    server = SimpleNamespace(
+        gui=gui, scene=scene, on_client_connect=lambda _: None, on_client_disconnect=lambda _: None, stop=lambda: None
+    )
+    made, wanted = {}, []
+    monkeypatch.setattr(live, "require_viewer", lambda: None)
+    monkeypatch.setitem(sys.modules, "viser", SimpleNamespace(ViserServer=lambda *_, **__: server))
+    page = LiveViewer(Views(torch.rand(3, 3, 16, 24), CAMERAS), on_number=wanted.append)
+    for number, switched in ((2, True), (2, False), (1, False), (1, True), (3, True)):
+        made["support views"].value, made["photographs"].value = number, switched
+        made["support views" if switched else "photographs"].move(None)
+        shown = [made[f"/photographs/{view}"].visible for view in range(3)]
+        assert shown == [switched and view < number for view in range(3)]
+    assert wanted == [2, 1, 3]
+    page.stop()
