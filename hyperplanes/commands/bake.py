@@ -69,7 +69,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.baking import BakedScene, coarsening, default_side
     from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, to_pixels
     from hyperplanes.geometry import cameras as camera
-    from hyperplanes.utilities.errors import prefix_errors
+    from hyperplanes.utilities.errors import rename_errors
     from hyperplanes.utilities.metrics import psnr
     from hyperplanes.utilities.writing import write_whole
 
@@ -84,7 +84,7 @@ def run(arguments: Arguments) -> int:
     elif arguments.turntable != "webp":
         raise ValueError(f"--turntable: expected --orbit, whose animation it is of, got {arguments.turntable} alone")
     if arguments.voxels is not None:
-        with prefix_errors("--voxels"):
+        with rename_errors("side", "--voxels"):
             coarsening(arguments.voxels)
     console, device = Console(), choose_device(arguments.device)
     refuse_baked(arguments.checkpoint, "bake")
