@@ -18,6 +18,7 @@ __all__ = [
     "OptionalNumber",
     "Protocol",
     "Steps",
+    "ViewsArguments",
     "ViewsUp",
     "check_fine_tune",
     "check_orbit",
@@ -49,19 +50,11 @@ ViewsUp = Annotated[str, tyro.conf.arg(metavar="{auto,y,z,x,-y,-z,-x}")]
 """The axis that points up in the world of photographs, three numbers, or auto: as the cameras are held."""
 
 
-@dataclass(frozen=True)
-class ObjectArguments:
-    """What the verbs of one object share: a model, the views that it is shown, and how they are read.
+@dataclass(frozen=True, kw_only=True)
+class ViewsArguments:
+    """How views are read, and what is done with them before anything adapts to them.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote, or a packaged model: small, small-paper, cars-64. A file that
-            `bake` wrote is taken by `render` and `export`.
-        views: The posed images of the object; example-car comes with the package.
-        out: The folder to write to; for `bake`, the file.
-        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
-            single forward pass.
-        all_views: Give the model all views. By default it gets every other one, the support views, and its pictures are
-            compared with the rest.
         learn_background: For photographs without masks: fit the object (the sphere at the centre of the scene) and the
             background together, and take what the object covers as masks.
         refine_poses: Refine the poses of all views first, and keep them where support views that the model is not given
@@ -74,17 +67,34 @@ class ObjectArguments:
         device: auto, cpu or cuda.
     """
 
-    checkpoint: Path
-    views: Path
-    out: Path
-    steps: Steps = 0
-    all_views: bool = False
     learn_background: bool = False
     refine_poses: bool = False
     no_reflections: bool = False
     up: ViewsUp = "auto"
     downscale: OptionalInt = None
     device: str = "auto"
+
+
+@dataclass(frozen=True)
+class ObjectArguments(ViewsArguments):
+    """What the verbs of one object share: a model, the views that it is shown, and how they are read.
+
+    Attributes:
+        checkpoint: What `train`, `adapt` or `demo` wrote, or a packaged model: small, small-paper, cars-64. A file that
+            `bake` wrote is taken by `render` and `export`.
+        views: The posed images of the object; example-car comes with the package.
+        out: The folder to write to; for `bake`, the file.
+        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
+            single forward pass.
+        all_views: Give the model all views. By default it gets every other one, the support views, and its pictures are
+            compared with the rest.
+    """
+
+    checkpoint: Path
+    views: Path
+    out: Path
+    steps: Steps = 0
+    all_views: bool = False
 
 
 def check_fine_tune(chosen: str, steps: int | str) -> None:

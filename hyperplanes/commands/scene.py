@@ -5,34 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.console import Console
-    from hyperplanes.commands.options import ObjectArguments
+    from hyperplanes.commands.options import ObjectArguments, ViewsArguments
     from hyperplanes.data.pictures.posed import Posed
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.geometry.rays import Sphere
     from hyperplanes.views import Task, Views
 
 __all__ = ["prepare_task", "read_object", "read_path", "read_scene", "refuse_sources", "say_up"]
-
-
-class Preparation(Protocol):
-    """Options of what is done with views before anything adapts to them."""
-
-    @property
-    def learn_background(self) -> bool:
-        """Whether the object is cut out of a background that is learned."""
-        ...
-
-    @property
-    def refine_poses(self) -> bool:
-        """Whether poses are refined."""
-        ...
 
 
 def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, console: Console) -> tuple[Task, str]:
@@ -56,7 +42,7 @@ def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, co
 
 
 def prepare_task(
-    arguments: Preparation, task: Task, source: HyperPlanes | BakedScene, console: Console, *, all_views: bool
+    arguments: ViewsArguments, task: Task, source: HyperPlanes | BakedScene, console: Console, *, all_views: bool
 ) -> Task:
     """Views whose background is learned and whose poses are refined, where that is asked for.
 

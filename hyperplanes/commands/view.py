@@ -29,7 +29,7 @@ import tyro
 
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import bake_field, load_source, refuse_of_baked
-from hyperplanes.commands.options import OptionalInt, ViewsUp
+from hyperplanes.commands.options import ViewsArguments
 from hyperplanes.commands.scene import prepare_task, read_scene
 from hyperplanes.utilities.interrupts import Terminated
 
@@ -47,7 +47,7 @@ EVERY = 5  # fine-tuning steps between two pictures
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(ViewsArguments):
     """What to show.
 
     Attributes:
@@ -58,16 +58,6 @@ class Arguments:
         compare: Methods of `hyperplanes evaluate` to see beside the model on the right half of the page, such as
             hull_blend, nearest_view, hyperplanes (the model without gradient steps), or scratch_100.
         port: Of the page on this machine.
-        learn_background: For photographs without masks: fit the object (the sphere at the centre of the scene) and the
-            background together, and take what the object covers as masks.
-        refine_poses: Refine the poses of the views first, and keep them where views that the model is not given are
-            shown better by half a decibel: for poses that are a little wrong.
-        no_reflections: Do not show the model the mirror images of the views of an object that looks symmetric.
-        up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
-            0,0.1,1, or auto: as the cameras are held.
-        downscale: Reduce the images by this factor, averaging pixels. When not given, images of more than a megapixel
-            are reduced to at most one.
-        device: auto, cpu or cuda.
     """
 
     views: tyro.conf.Positional[Path]
@@ -76,12 +66,6 @@ class Arguments:
     fit: Annotated[int, range(10_000)] = 100
     compare: tuple[str, ...] = ()
     port: Annotated[int, range(65_536)] = 8080
-    learn_background: bool = False
-    refine_poses: bool = False
-    no_reflections: bool = False
-    up: ViewsUp = "auto"
-    downscale: OptionalInt = None
-    device: str = "auto"
 
 
 def run(arguments: Arguments) -> int:
