@@ -271,7 +271,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
             ["export", "--checkpoint", "RUN", "--views", "DATA", "--out", "OUT/x", "--level", "-3"],
             ["--level: expected a density above 0, got -3"],
         ),
-        ([*BAKE, "OUT/bk.safetensors", "--voxels", "0"], ["--voxels: side: expected a multiple of 2 from 8 to 512"]),
+        ([*BAKE, "OUT/bk.safetensors", "--voxels", "0"], ["--voxels: expected a multiple of 2 from 8 to 512"]),
         (
             ["render", "--checkpoint", "RUN", "--views", "pyproject.toml", "--out", "OUT/x"],
             ["pyproject.toml", "found a file of another kind"],

@@ -93,7 +93,11 @@ def test_view_shows_the_object_alone(scene, monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(live, "require_viewer", lambda: None)
-    monkeypatch.setattr(live, "LiveViewer", lambda support, *rest: shown.append(support) or Mock())
+    monkeypatch.setattr(
+        live,
+        "LiveViewer",
+        lambda support, port, *rest: shown.append(support) or Mock(address=f"http://localhost:{port}"),
+    )
     monkeypatch.setattr(view, "load_source", lambda *rest, **named: None)
     monkeypatch.setattr(view, "_adapt", interrupted)
     assert view.run(view.Arguments(tmp_path, learn_background=True)) == 0
