@@ -125,7 +125,7 @@ class EpisodeLoader:
         }
 
     def names_of(self, step: int) -> list[str]:
-        """The objects of the step after so many, different ones while there are enough: to render, then for reference."""
+        """The objects of the step after so many, different while there are enough: to render, then for reference."""
         config, generator = self.config, step_generator(self.config.seed, step)
         count = config.tasks + reference_objects(self.model.config, config)
         if config.views:
