@@ -212,7 +212,6 @@ class Runner:
             "seed": seed,
             "views": self._views(cell, checkpoint),
             "fine_tuning": stated(self.fine_tuning(cell)),
-            **self._own_sampling(cell),
             **({} if cell.query is None else {"query": cell.query}),
             **({"orbit": cell.orbit} if cell.orbit else {}),
             **({"measured_alone": self._measured_by()} if _is_time(cell) else {}),
@@ -300,11 +299,6 @@ class Runner:
         if cell.trained.method in LEARNED or (cell.trainable == "weights" and not for_all_weights):
             return FineTuning()
         return self.scale.scratch if "_scratch_" in cell.method else self.scale.fine_tuning
-
-    def _own_sampling(self, cell: Cell) -> dict[str, Any]:
-        """How a learned initialisation is sampled, where the scale has it otherwise than its protocol; JSON-able."""
-        sampling = self.scale.learned.get("model.sampling") if cell.trained.method in LEARNED else None
-        return {} if sampling is None else {"sampling": repr(sampling)}
 
     def _views(self, cell: Cell, checkpoint: Path) -> int:
         """How many support views a cell shows: as many as the model has planes, where it does not say."""
