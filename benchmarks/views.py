@@ -8,7 +8,8 @@ Of every held-out object some query views are kept back to be judged by; of all 
 are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
 (where there are masks), of views alone and with their reflections; the model without its hypernetwork, with the update
 of another object of the data set, with its own alone, averaged with the visual hull by one share an object, without
-reflections of views, without a canonical frame, with one ray a pixel, in single precision, with residual correction (of
+reflections of views, without a canonical frame, without
+learned steps, with one ray a pixel, in single precision, with residual correction (of
 steps, too), and as it is used; and fine-tuned. Beside each mean stands how far it lies above `hull_blend`, steps above
 as many from random weights, and what is corrected above what is not, with the 95 % interval of that difference over the
 objects (paired, Student's t).
@@ -329,6 +330,13 @@ class _FieldAlone:
         return placed.in_scene(model.rendering_field(prepared, parameters))
 
 
+def _without_learned_steps(model: HyperPlanes) -> HyperPlanes:
+    """The model whose fields are those of the hypernetwork's update alone."""
+    made = HyperPlanes(replace(model.config, learned_steps=0))
+    made.load_state_dict({name: value for name, value in model.state_dict().items() if name in made.state_dict()})
+    return made.eval()
+
+
 @dataclass(frozen=True)
 class _Ungated:
     """A model without its gating network: one share of the visual hull an object, and fine-tuned fields alone."""
@@ -409,6 +417,7 @@ METHODS = {
     "ungated": lambda model, *_: _Ungated(model),
     "unreflected": lambda model, *_: _Unreflected(model),
     "unrotated": lambda model, *_: _Unrotated(model),
+    "no_learned_steps": lambda model, *_: _without_learned_steps(model),
     "one_ray": lambda model, *_: _Rendered(model, {"antialias": False}),
     "residuals": lambda model, *_: WithResiduals(model),
     "single_precision": lambda model, *_: _Rendered(model, {"mixed_precision": False}),

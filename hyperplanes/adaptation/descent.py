@@ -25,7 +25,7 @@ from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
 
-__all__ = ["Descent", "Variables", "contrast", "draw_pixels", "ray_loss", "split_holdout"]
+__all__ = ["Descent", "Variables", "contrast", "draw_pixels", "pixels_of", "ray_loss", "split_holdout"]
 
 HOLDOUT_RAYS = 4096  # of held-out views that "auto" compares
 PART = 512  # rays of a step whose gradients one thread finds, at most
@@ -180,7 +180,7 @@ class Descent:
             with torch.enable_grad():
                 # the views that this step's rays come from, which the field is not shown
                 masked = self._draw_views(generator) if masks_views else None
-                among = self._pixels_of(masked) if masked is not None else self.pixels
+                among = self.pixels if masked is None else pixels_of(masked, views, self.pixels)
                 # the field of the variables as they are now, and how far its rays are from the truth
                 field = self.field(masked)
                 near_far, weights = field.sampling.near_far, None
@@ -287,13 +287,20 @@ class Descent:
             drawn = drawn[(torch.searchsorted(self.pixels, edges).diff() > 0)[drawn]]
         return drawn[: max(1, len(self.views) // self.settings.holdout)]
 
-    def _pixels_of(self, chosen: Int[Tensor, " chosen"]) -> Int[Tensor, " among"]:
-        """Flat indices of the pixels of some views: all of them, or those of `pixels`."""
-        area = self.views.size[0] * self.views.size[1]
-        if self.pixels is None:
-            return (chosen[:, None] * area + torch.arange(area, device=chosen.device)).flatten()
-        edges = torch.searchsorted(self.pixels, torch.stack([chosen, chosen + 1], 1) * area)
-        return torch.cat([self.pixels[start:stop] for start, stop in edges.tolist()])
+
+def pixels_of(chosen: Int[Tensor, " chosen"], views: Views, pixels: Int[Tensor, " pixel"] | None) -> Tensor:
+    """Flat indices (view, row, column) of the pixels of some views: all of them, or those among given ones.
+
+    Args:
+        chosen: indices of the views.
+        views: all of them.
+        pixels: flat indices, ascending; all where None.
+    """
+    area = views.size[0] * views.size[1]
+    if pixels is None:
+        return (chosen[:, None] * area + torch.arange(area, device=chosen.device)).flatten()
+    edges = torch.searchsorted(pixels, torch.stack([chosen, chosen + 1], 1) * area)
+    return torch.cat([pixels[start:stop] for start, stop in edges.tolist()])
 
 
 def split_holdout(support: Views, settings: FineTuning) -> tuple[Views, Views]:

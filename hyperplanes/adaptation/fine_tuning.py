@@ -12,8 +12,9 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.canonical_frame import to_canonical_frame
-from hyperplanes.adaptation.context import SupportContext, observe
+from hyperplanes.adaptation.context import SupportContext, observe, trained_on
 from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
+from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import stacked_field, tuned_field
 from hyperplanes.configuration.compatibility import check_fine_tuning
@@ -21,11 +22,10 @@ from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "made_anyway", "make_descent", "one_step", "trained_on"]
+__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "made_anyway", "make_descent", "one_step"]
 
 Made = TypeVar("Made")
 
-MOST_REFLECTED = 15  # given views, up to which gradient steps take rays of their reflections, too
 NEARLY = 0.99  # of the error of an empty picture, which a field that has lost everything may miss by rounding
 
 
@@ -91,7 +91,7 @@ def fine_tune(
     trial, _ = make_descent(network, context, settings, trained_on(context, placed.views))
     pixels = network.live_pixels_of(context, holdout)
     with torch.no_grad():
-        unchanged = network.field(context, network.adapted_weights(context))
+        unchanged = network.field(context, updated_weights(network, context))
     stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
@@ -128,21 +128,7 @@ def one_step(network: HyperPlanesNetwork, support: Views) -> AdaptedField:
     """
     placed = to_canonical_frame(network, support)
     context = placed.context(network)
-    return placed.in_scene(stacked_field(network, context, network.adapted_weights(context)))
-
-
-def trained_on(context: SupportContext, support: Views) -> Views:
-    """Where rays come from: the support views, in their order, or a few and their reflections about one plane.
-
-    Rays of reflections about several planes show 0.3 dB less (17 lamps from 3 and 5 views, 100 steps). Many views show
-    an object well enough, and what is not quite symmetric would be learned wrongly (docs/image-based-measurements.md).
-
-    Args:
-        context: of the object.
-        support: the views, without reflections.
-    """
-    few = context.symmetry is not None and len(support) <= MOST_REFLECTED
-    return context.views[: 2 * len(support)] if few else support
+    return placed.in_scene(stacked_field(network, context, updated_weights(network, context)))
 
 
 def fine_tune_to(
@@ -174,7 +160,7 @@ def fine_tune_to(
         if on_step is not None:
             on_step(0)
         with torch.no_grad():
-            return stacked_field(network, context, network.adapted_weights(context))
+            return stacked_field(network, context, updated_weights(network, context))
     descent, variables = make_descent(network, context, settings, views)
     before, _ = descent.errors()
     for done in descent.run(steps if schedule is None else schedule):
@@ -233,7 +219,7 @@ def _variables(
         observed, theta = observe([context], network.hypernetwork.resolution), network.theta.detach()
         return Variables.of_hypernetwork(network.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
     if start is None:
-        start = _refreshed(network, network.adapted_weights(context), settings)
+        start = _refreshed(network, updated_weights(network, context), settings)
         start = network.finer(start, settings.cells or 0)
     return Variables.of_weights(start)
 

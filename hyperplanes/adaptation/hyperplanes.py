@@ -15,6 +15,7 @@ from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.fine_tuning import fine_tune, one_step
 from hyperplanes.adaptation.hub import upload_checkpoint
+from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.rotation import RotatedField
 from hyperplanes.adaptation.stacking import learned_part, stacked_field
@@ -50,10 +51,12 @@ class HyperPlanes(HyperPlanesNetwork):
 
     @checked
     @without_autocast
+    @torch.inference_mode(mode=False)  # learned steps read gradients
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The field of one object in one forward pass: theta + delta (HyperPlanes, Eq. 6).
 
+        A network then takes `config.learned_steps` steps of gradient descent (`adaptation.learned_steps`).
         Where `config.symmetric` says so, reflections of the views of an object that looks symmetric count as views, too
         (`adaptation.symmetry`), and it is adapted to in its canonical frame (`adaptation.canonical_frame`). Where
         `config.stacked` says so, its pictures are means with those of the visual hull (`adaptation.stacking`).
@@ -75,10 +78,11 @@ class HyperPlanes(HyperPlanesNetwork):
         """
         return find_symmetry(self, support)
 
+    @torch.inference_mode(mode=False)
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:
         """As `adapt`, of an object that is prepared, with reflections of its views or without."""
-        return stacked_field(self, context, self.adapted_weights(context))
+        return stacked_field(self, context, updated_weights(self, context))
 
     @checked
     @without_autocast

@@ -19,14 +19,17 @@ from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
 from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.reflections import Symmetry
-from hyperplanes.hypernetwork import HyperNetwork
+from hyperplanes.hypernetwork import HyperNetwork, LearnedStep
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.seeding import seeded
 from hyperplanes.views import Views
 
-__all__ = ["HyperPlanesNetwork", "in_use"]
+__all__ = ["GRID", "HyperPlanesNetwork", "in_use"]
+
+GRID = "fine.grid.weight"
+"""The grid of features of a field, among its weights."""
 
 
 class HyperPlanesNetwork(nn.Module):
@@ -57,6 +60,9 @@ class HyperPlanesNetwork(nn.Module):
                 reading, volume = self.target.reading_layers, self.target.volume_size
                 self.hypernetwork = make_hypernetwork(shape, shapes, reading, volume)
             self.gate = GatingNetwork() if config.gated else None
+            self.learned_step: LearnedStep | None = None
+            if config.learned_steps and self.target.volume_size is not None:
+                self.learned_step = LearnedStep(*self.target.volume_size, self.theta[GRID].shape[0])
         self.register_buffer("rig", torch.zeros(self.target.rig_size, 3))
 
     @property

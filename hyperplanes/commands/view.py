@@ -172,7 +172,8 @@ def _adapt(
     import torch
 
     from hyperplanes.adaptation.canonical_frame import to_canonical_frame
-    from hyperplanes.adaptation.fine_tuning import make_descent, trained_on
+    from hyperplanes.adaptation.context import trained_on
+    from hyperplanes.adaptation.fine_tuning import make_descent
     from hyperplanes.adaptation.stacking import tuned_field
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene, default_side

@@ -31,6 +31,10 @@ def check_model(config: ModelConfig) -> type[Target]:
         expected, found = target.config_type.__name__, type(config.network).__name__
         raise ValueError(f"network: expected a {expected} for {config.target}, got a {found}")
     _check_hypernetwork(config, target)
+    if config.learned_steps and not isinstance(config.hypernetwork, VolumeHyperNetworkConfig):
+        raise ValueError(
+            f"learned_steps: expected 0 without a hypernetwork of kind 'volume', got {config.learned_steps}"
+        )
     if config.plane_dropout and (target.permutation_invariant or not target.reads_planes):
         raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
     for name in ("stacked", "hull_share", "gated", "symmetric", "symmetry", "azimuth"):

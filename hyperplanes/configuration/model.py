@@ -55,6 +55,8 @@ class ModelConfig:
         hull_share: of `hull_blend` in the pictures of a model that is not `stacked`: what was decided for one object.
         gated: a gating network makes a share of every pixel of that one (`adaptation.gating`); `training.gating` trains
             it after the model. With ten given views or more it also mixes the hull into pictures after gradient steps.
+        learned_steps: steps of gradient descent that a network takes after the forward pass
+            (`adaptation.learned_steps`); `training.learned_step` trains it after the model.
         symmetric: views of an object that looks symmetric are shown to the model together with their reflections
             (`adaptation.symmetry`). Training does without.
         symmetry: that of the object, where it is known: what was found for one.
@@ -75,6 +77,7 @@ class ModelConfig:
     stacked: bool = False
     hull_share: float = 0.0
     gated: bool = False
+    learned_steps: Annotated[int, range(33)] = 0
     symmetric: bool = False
     symmetry: Symmetry | None = None
     azimuth: float | None = None
@@ -113,7 +116,7 @@ class ModelConfig:
     def target_alone(self) -> ModelConfig:
         """The model without what finds weights for its target, and without the visual hull beside its pictures."""
         alone = replace(self, hypernetwork=None, autoencoder=None, initialisation=None)
-        return replace(alone, stacked=False, hull_share=0.0, gated=False)
+        return replace(alone, stacked=False, hull_share=0.0, gated=False, learned_steps=0)
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""

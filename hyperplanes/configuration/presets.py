@@ -107,14 +107,14 @@ class Preset:
 
     def for_known_places(self) -> Preset:
         """Without what only a field of any number of views can do: be trained by some of them, and be shown more."""
-        alone = {"stacked": False, "gated": False, "hull_share": 0.0, "symmetric": False}
+        alone = {"stacked": False, "gated": False, "learned_steps": 0, "hull_share": 0.0, "symmetric": False}
         model = replace(self.model, **alone, symmetry=None, azimuth=None)
         return replace(self, model=model, training=replace(_of_all_views(self.training), volume_loss=0.0))
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
         training = replace(self.training, volume_loss=0.0)  # of what a hypernetwork reads
-        model = replace(self.model, hypernetwork=None, autoencoder=None, initialisation=None)
+        model = replace(self.model, hypernetwork=None, autoencoder=None, initialisation=None, learned_steps=0)
         return replace(self, model=model, training=training)
 
     def with_autoencoder(self) -> Preset:

@@ -10,6 +10,7 @@ from hyperplanes.hypernetwork.configuration import (
 )
 from hyperplanes.hypernetwork.encoders import ConvNet, ResNet101
 from hyperplanes.hypernetwork.image_hypernetwork import ImageHyperNetwork
+from hyperplanes.hypernetwork.learned_step import LearnedStep
 from hyperplanes.hypernetwork.volume_hypernetwork import VolumeHyperNetwork
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "HyperNetworkConfig",
     "ImageHyperNetwork",
     "ImageHyperNetworkConfig",
+    "LearnedStep",
     "Observed",
     "ResNet101",
     "VolumeHyperNetwork",

@@ -82,6 +82,8 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
     found = HyperPlanes.from_pretrained(reference)
     if model.gate is None:  # a gating network is trained after the model, on what that shows
         found.gate = None
+    if model.learned_step is None:  # as is this one
+        found.learned_step = None
     if _shapes(model) != _shapes(found):
         config, names = found.config, model.config.differences(found.config)
         parts = {name: name.partition(".")[0] for name in names}

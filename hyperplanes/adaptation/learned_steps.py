@@ -1,0 +1,97 @@
+"""Learned steps of gradient descent, after the forward pass of the hypernetwork."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from hyperplanes.adaptation.context import SupportContext, trained_on
+from hyperplanes.adaptation.descent import pixels_of, ray_loss
+from hyperplanes.adaptation.gradients import summed_gradients
+from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork
+from hyperplanes.parameters import Parameters
+
+__all__ = ["grid_gradient", "updated_weights"]
+
+RAYS, PARTS = 2048, 4  # of a step, and into how many parts these are divided, each with other views masked
+ONE_IN = 6  # views that are masked in a part
+
+
+def updated_weights(network: HyperPlanesNetwork, context: SupportContext) -> Parameters:
+    """The weights of an object: theta + delta, and after that the learned steps of `ModelConfig.learned_steps`.
+
+    Args:
+        network: the model.
+        context: the object.
+
+    Returns:
+        Those of `HyperPlanesNetwork.adapted_weights` where the model has no learned steps, and for an object without
+        masks or of a single view.
+    """
+    weights = network.adapted_weights(context)
+    step = network.learned_step
+    if step is None or context.volume is None or context.views.masks is None or len(context.given) < 2:
+        return weights
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(network.config.learned_steps):
+        error, gradient = grid_gradient(network, context, weights, RAYS, generator)
+        with torch.no_grad():
+            change = step(context.volume[None], weights[GRID][None], gradient[None], error[None])[0]
+        weights = weights + {GRID: change}
+    return weights
+
+
+def grid_gradient(
+    network: HyperPlanesNetwork,
+    context: SupportContext,
+    weights: Parameters,
+    rays: int,
+    generator: torch.Generator,
+    *,
+    pixels: Int[Tensor, " pixel"] | None = None,
+) -> tuple[Tensor, Float[Tensor, "feature x y z"]]:
+    """The error of random rays of the views of an object, and its gradient in the grid of features.
+
+    The field is not shown the views that rays come from, as in fine-tuning.
+
+    Args:
+        network: the model.
+        context: the object.
+        weights: of its field.
+        rays: how many.
+        generator: of views, rays and samples, on the CPU.
+        pixels: flat indices of those that rays are drawn from; found where absent.
+
+    Returns:
+        The mean squared error, and the gradient; zeros where no ray meets the object.
+    """
+    views = trained_on(context, context.given)
+    if pixels is None:
+        pixels = network.live_pixels_of(context, views)
+    parts = _masked(len(views), generator)
+    generators = [torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator))) for _ in parts]
+    grid = weights[GRID].detach().clone().requires_grad_(True)
+    variable = Parameters({**weights.detach(), GRID: grid})
+
+    def loss(part: int) -> Tensor:
+        masked = parts[part].to(views.images.device)
+        among = pixels_of(masked, views, pixels)
+        if not len(among):
+            return 0 * grid.sum()
+        field = network.field(context.mask_views(masked) if len(context.views) > 1 else context, variable)
+        drawn, truth = views.sample_rays(
+            rays // len(parts), generator=generators[part], among=among, near_far=field.sampling.near_far
+        )
+        return ray_loss(field.trace(drawn, generators[part]), truth) / len(parts)
+
+    thread_safe = network.field(context, variable).thread_safe
+    error, (gradient,) = summed_gradients(loss, len(parts), [grid], thread_safe=thread_safe)
+    return error, torch.zeros_like(grid) if gradient is None else gradient
+
+
+def _masked(count: int, generator: torch.Generator) -> list[Int[Tensor, " masked"]]:
+    """The views that each part masks: random ones, and none twice before all were."""
+    size = max(1, count // ONE_IN)
+    order = torch.cat([torch.randperm(count, generator=generator) for _ in range(-(-PARTS * size // count))])
+    return list(order[: PARTS * size].split(size))

@@ -1,0 +1,112 @@
+"""The training of learned steps of gradient descent, after that of the model that they follow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from hyperplanes.adaptation.gradients import summed_gradients
+from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.learned_steps import grid_gradient
+from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork, in_use
+from hyperplanes.adaptation.optimisers import make_optimisers
+from hyperplanes.configuration.training import TrainingConfig
+from hyperplanes.hypernetwork import LearnedStep
+from hyperplanes.parameters import Parameters
+from hyperplanes.training.distributed import Processes
+from hyperplanes.training.episodes import Draw, EpisodeLoader
+from hyperplanes.training.forward import forward
+from hyperplanes.training.losses import photometric_loss
+from hyperplanes.utilities.seeding import seeded
+from hyperplanes.views import Tasks
+
+__all__ = ["fit_learned_step"]
+
+RAYS = 512  # of the views shown, from which a gradient is found
+SECOND = 0.25  # how often the step that is trained follows another one
+RATE, MUON_RATE, WARMUP, LAST = 1e-3, 0.01, 100, 0.02  # rates at first, steps until then, and what they fall to
+
+
+def fit_learned_step(
+    model: HyperPlanes, data: Tasks, config: TrainingConfig, *, on_step: Callable[[int, float], None] | None = None
+) -> LearnedStep:
+    """Train learned steps of a model, whose own weights stay as they are.
+
+    The loss is the squared error of query rays after one step; in a quarter of the draws the second of two.
+
+    Args:
+        model: with a hypernetwork that reads a volume; it needs no learned steps yet.
+        data: the objects that it was trained on, or others.
+        config: of the episodes, rays and number of the steps; rates and optimisers are those of this module.
+        on_step: called with the number of steps done and the loss of the last one.
+
+    Returns:
+        The network, for a model with `ModelConfig.learned_steps`.
+    """
+    with seeded(config.seed):
+        fitted = HyperPlanesNetwork(replace(model.config, learned_steps=1)).learned_step
+    assert fitted is not None
+    fitted = fitted.to(model.rig).requires_grad_()
+    optimisers = make_optimisers(list(fitted.parameters()), "muon", RATE, MUON_RATE, betas=(0.9, 0.99))
+    rates = [each.param_groups[0]["lr"] for each in optimisers]
+    loader = EpisodeLoader(model, data, config, Processes.current())
+    try:
+        for step in range(config.steps):
+            loader.expect(step)
+            with in_use(model):
+                loss = _gradients(model, fitted, loader.batch(step).rendered, config)
+            share = (1 + math.cos(math.pi * step / config.steps)) / 2
+            factor = min(1, (step + 1) / WARMUP) * (LAST + (1 - LAST) * share)
+            for optimiser, rate in zip(optimisers, rates, strict=True):
+                optimiser.param_groups[0]["lr"] = rate * factor
+                optimiser.step()
+            if on_step is not None:
+                on_step(step + 1, loss)
+    finally:
+        loader.close()
+    return fitted.requires_grad_(requires_grad=False)
+
+
+def _gradients(model: HyperPlanes, fitted: LearnedStep, draws: Sequence[Draw], config: TrainingConfig) -> float:
+    """Set the gradients of the network for the objects of a step; returns the mean loss."""
+    contexts = [draw.episode.prepared for draw in draws]
+    theta = model.theta.detach()
+    with torch.no_grad():
+        updates = model.updates(contexts)
+    volumes, grids, gradients, errors = [], [], [], []
+    for place, draw in enumerate(draws):
+        error, gradient = _error(model, draw, theta + updates[place])
+        assert draw.episode.prepared.volume is not None
+        volume = draw.episode.prepared.volume
+        if float(torch.rand((), generator=draw.generator)) < SECOND:
+            with torch.no_grad():
+                grid = (theta + updates[place])[GRID]
+                change = fitted(volume[None], grid[None], gradient[None], error[None])[0]
+            updates[place] = updates[place] + {GRID: change}
+            error, gradient = _error(model, draw, theta + updates[place])
+        volumes.append(volume)
+        grids.append((theta + updates[place])[GRID])
+        gradients.append(gradient)
+        errors.append(error)
+    with torch.enable_grad():
+        written = fitted(*(torch.stack(each) for each in (volumes, grids, gradients, errors)))
+    change = written.detach().requires_grad_()
+
+    def loss(place: int) -> Tensor:
+        update = updates[place] + {GRID: change[place]}
+        return photometric_loss(forward(model, draws[place], update, config)) / len(draws)
+
+    total, (found,) = summed_gradients(loss, len(draws), [change])
+    fitted.zero_grad()
+    written.backward(found)
+    return float(total)
+
+
+def _error(model: HyperPlanes, draw: Draw, weights: Parameters) -> tuple[Tensor, Tensor]:
+    """The error of rays of the views that are shown, and its gradient."""
+    pixels = draw.episode.support_live
+    return grid_gradient(model, draw.episode.prepared, weights, RAYS, draw.generator, pixels=pixels)
