@@ -6,15 +6,25 @@ switched off must each move the figure.
 
 import math
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import pytest
 import torch
 
 from benchmarks.objects import held_out
-from hyperplanes.adaptation import HullBlend, HyperPlanes, ResidualField, diagnose, reflections, swap_gap, symmetry
+from hyperplanes.adaptation import (
+    HullBlend,
+    HyperPlanes,
+    ResidualField,
+    diagnose,
+    learned_steps,
+    reflections,
+    swap_gap,
+    symmetry,
+)
 from hyperplanes.adaptation.descent import LEAST, contrast, draw_pixels, ray_loss
 from hyperplanes.adaptation.fine_tuning import make_descent
+from hyperplanes.adaptation.learned_steps import grid_gradient
 from hyperplanes.adaptation.rotation import RotatedField, Rotation
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import TargetConfig
@@ -259,6 +269,27 @@ def test_products_of_bfloat16_cost_a_hundredth_of_a_decibel():
 def test_an_object_that_means_nothing_is_shown_better_than_by_its_hull(count, least):
     """By 2.1 and 2.6 dB; `benchmarks views` has the mean over many."""
     assert mean_psnr(coarse("small"), shape(), count) > mean_psnr(HullBlend(), shape(), count) + least
+
+
+def test_learned_steps_bring_decibels_by_the_gradient_that_they_read(monkeypatch):
+    """18.8 dB without, 22.3 with both; by random numbers in place of the gradient 18.1, by its negative 14.8."""
+    model, task = coarse("small"), shape()
+    found = {"two": mean_psnr(model, task, 3)}
+    for name, change in (("random", torch.randn_like), ("negative", torch.neg)):
+        monkeypatch.setattr(learned_steps, "grid_gradient", partial(_changed, grid_gradient, change))
+        torch.manual_seed(0)
+        found[name] = mean_psnr(model, task, 3)
+    model.config = replace(model.config, learned_steps=0)
+    without = mean_psnr(model, task, 3)
+    assert found["two"] > without + 2
+    assert found["random"] < without + 0.2
+    assert found["negative"] < without - 1
+
+
+def _changed(find, change, *inputs, **options):
+    """An error and another gradient."""
+    error, gradient = find(*inputs, **options)
+    return error, change(gradient)
 
 
 @pytest.mark.parametrize(("kind", "count", "least"), [("car", 3, 0.5), ("lamp", 5, 1.0)])

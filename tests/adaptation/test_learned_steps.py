@@ -1,0 +1,132 @@
+"""Source of truth: the gradient of the mean loss by autograd, differences of that loss, and steps that are none."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import HyperPlanes, learned_steps
+from hyperplanes.adaptation.learned_steps import PARTS, grid_gradient, updated_weights
+from hyperplanes.adaptation.network import GRID
+from hyperplanes.configuration.training import TrainingConfig
+from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.training.learned_step import fit_learned_step
+from tests.adaptation.test_stacking import CONFIG, model
+from tests.reference_rendering import Balls, ball_views, ring
+
+
+def stepping(steps=2):
+    """A model whose learned steps go against the gradient."""
+    made = HyperPlanes(replace(CONFIG, stacked=False, learned_steps=steps))
+    made.load_state_dict(model().state_dict(), strict=False)
+    made.learned_step.rates.fill_(1.0)
+    return made.eval()
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def test_the_gradient_is_that_of_the_error():
+    adapter = stepping().double()
+    context = adapter.prepare(ball_views(ring(5)))
+    weights = adapter.adapted_weights(context)
+    error, gradient = grid_gradient(adapter, context, weights, 512, generator())
+    assert gradient.shape == weights[GRID].shape
+    change = gradient / gradient.norm()
+    ahead, behind = (
+        grid_gradient(adapter, context, weights + {GRID: step * change}, 512, generator())[0] for step in (1e-3, -1e-3)
+    )
+    assert float(ahead - behind) / 2e-3 == pytest.approx(float(gradient.norm()), rel=1e-3)
+    assert error > 0
+
+
+def test_rays_come_from_views_that_the_field_is_not_shown(monkeypatch):
+    masked, adapter = [], stepping()
+    context = adapter.prepare(ball_views(ring(13)))
+    kind = type(context)
+    own = kind.mask_views
+    monkeypatch.setattr(kind, "mask_views", lambda self, views: masked.append(views.tolist()) or own(self, views))
+    grid_gradient(adapter, context, adapter.adapted_weights(context), 64, generator())
+    assert sorted(len(each) for each in masked) == [2] * PARTS
+    assert len(set(sum(masked, []))) == 2 * PARTS
+
+
+def test_every_view_is_masked_once_before_any_is_again():
+    for count in (2, 3, 5, 40):
+        parts = learned_steps._masked(count, generator(count))
+        times = torch.bincount(torch.cat(parts), minlength=count)
+        assert len(parts) == PARTS
+        assert int(times.max() - times.min()) <= 1
+
+
+def test_steps_lower_the_error_and_are_the_same_each_time():
+    adapter, support = stepping(3), ball_views(ring(6))
+    context = adapter.prepare(support)
+    errors = [
+        grid_gradient(adapter, context, weights, 4096, generator(9))[0]
+        for weights in (adapter.adapted_weights(context), updated_weights(adapter, context))
+    ]
+    assert errors[1] < errors[0] - 1e-5
+    first, second = (updated_weights(adapter, context)[GRID] for _ in range(2))
+    assert torch.equal(first, second)
+
+
+def changed(adapter, support, **options):
+    """Whether learned steps change the weights of an object."""
+    context = adapter.prepare(support, **options)
+    return not torch.equal(updated_weights(adapter, context)[GRID], adapter.adapted_weights(context)[GRID])
+
+
+def test_there_are_none_for_a_single_view_nor_without_masks():
+    views, plane = ball_views(ring(3)), Symmetry(Plane((1.0, 0.0, 0.0)))
+    assert changed(stepping(), views)
+    assert changed(stepping(), views, symmetry=plane)
+    assert not changed(stepping(), views[:1])
+    assert not changed(stepping(), views[:1], symmetry=plane)
+    assert not changed(stepping(), ball_views(ring(3), masks=False))
+    assert not changed(model(), views)
+
+
+def test_they_are_taken_in_inference_mode_too():
+    adapter, support = stepping(), ball_views(ring(4))
+    plain = adapter.adapt(support).render(support.cameras).images
+    with torch.inference_mode():
+        made = adapter.adapt(ball_views(ring(4))).render(support.cameras).images
+    assert torch.equal(plain, made)
+
+
+def test_a_checkpoint_keeps_them(tmp_path):
+    adapter, support = stepping(), ball_views(ring(3))
+    adapter.save(tmp_path)
+    found = HyperPlanes.from_pretrained(tmp_path)
+    assert torch.equal(
+        found.adapt(support).field.parameters["grid.weight"], adapter.adapt(support).field.parameters["grid.weight"]
+    )
+
+
+def test_the_weights_of_one_object_take_none():
+    adapter, support = stepping(), ball_views(ring(3))
+    adapted = adapter.adapt(support)
+    alone = adapter.with_weights_of(adapted)
+    assert not alone.config.learned_steps
+    torch.testing.assert_close(
+        alone.adapt(support).render(support.cameras).images, adapted.render(support.cameras).images
+    )
+
+
+def test_what_has_no_grid_takes_none():
+    with pytest.raises(ValueError, match="learned_steps: expected 0 without a hypernetwork of kind 'volume', got 2"):
+        HyperPlanes(replace(CONFIG, hypernetwork=None, learned_steps=2))
+
+
+def test_training_lowers_the_error_of_query_views_and_leaves_the_model_alone():
+    adapter = stepping(1)
+    config = TrainingConfig(steps=25, tasks=2, rays=64, views=(2, 3, 4), held_out=0)
+    before, losses = {name: value.clone() for name, value in adapter.state_dict().items()}, []
+    fitted = fit_learned_step(adapter, Balls(views=6), config, on_step=lambda step, loss: losses.append(loss))
+    assert len(losses) == 25
+    assert fitted.network.last.weight.any()
+    assert not any(value.requires_grad for value in fitted.parameters())
+    assert all(torch.equal(value, before[name]) for name, value in adapter.state_dict().items())
+    assert sum(losses[-8:]) < 0.9 * sum(losses[:8])
