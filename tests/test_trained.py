@@ -367,8 +367,9 @@ def by_parts(task, count, model):
 
 
 def test_views_that_are_held_out_find_out_what_is_wrong_for_an_object():
-    """A car with what the model says of a lamp; alone it is what `swap_gap` measures."""
+    """A car with what the model says of a lamp; alone it is what `swap_gap` measures, and no learned step mends it."""
     model = coarse("small")
+    model.config = replace(model.config, learned_steps=0)
     foreign = model.update(model.prepare(lamp().support[::2]))
     model.update = lambda context: foreign
     alone, by_object, by_pixel = by_parts(cars()[0], 12, model)

@@ -219,7 +219,7 @@ def _variables(
         observed, theta = observe([context], network.hypernetwork.resolution), network.theta.detach()
         return Variables.of_hypernetwork(network.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
     if start is None:
-        start = _refreshed(network, updated_weights(network, context), settings)
+        start = _refreshed(network, network.adapted_weights(context), settings)  # without learned steps
         start = network.finer(start, settings.cells or 0)
     return Variables.of_weights(start)
 
