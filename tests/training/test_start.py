@@ -10,12 +10,13 @@ from tests.reference_rendering import Balls
 
 
 def test_a_training_by_its_preset_begins_with_the_packaged_weights(tmp_path):
-    """Without the gating network, which is trained after the model."""
+    """Without the gating network and the learned steps, which are trained after the model."""
     packaged, chosen = find_checkpoint("small"), preset("small")
     trainer = start_training(chosen.model, chosen.training, Balls(), tmp_path, reference=packaged)
     weights = HyperPlanes.from_pretrained(packaged).state_dict()
     found = trainer.model.state_dict()
-    assert [name for name in weights if name not in found] == [name for name in weights if name.startswith("gate.")]
+    later = [name for name in weights if name.startswith(("gate.", "learned_step."))]
+    assert [name for name in weights if name not in found] == later
     assert all(torch.equal(value, weights[name]) for name, value in found.items() if name in weights)
     assert found.keys() <= weights.keys()
 
