@@ -22,6 +22,7 @@ The suites are the data sets that every model is judged by; none of their object
 from __future__ import annotations
 
 import argparse
+import copy
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -331,9 +332,9 @@ class _FieldAlone:
 
 def _without_learned_steps(model: HyperPlanes) -> HyperPlanes:
     """The model whose fields are those of the hypernetwork's update alone."""
-    made = HyperPlanes(replace(model.config, learned_steps=0))
-    made.load_state_dict({name: value for name, value in model.state_dict().items() if name in made.state_dict()})
-    return made.eval()
+    alone = copy.copy(model)  # with the same weights
+    alone.config = replace(model.config, learned_steps=0)
+    return alone
 
 
 @dataclass(frozen=True)

@@ -56,8 +56,8 @@ class HyperPlanes(HyperPlanesNetwork):
     def adapt(self, support: Views) -> AdaptedField:
         """The field of one object in one forward pass: theta + delta (HyperPlanes, Eq. 6).
 
-        A network then takes `config.learned_steps` steps of gradient descent (`adaptation.learned_steps`).
-        Where `config.symmetric` says so, reflections of the views of an object that looks symmetric count as views, too
+        A network then takes `config.learned_steps` steps of gradient descent (`adaptation.learned_steps`). Where
+        `config.symmetric` says so, reflections of the views of an object that looks symmetric count as views, too
         (`adaptation.symmetry`), and it is adapted to in its canonical frame (`adaptation.canonical_frame`). Where
         `config.stacked` says so, its pictures are means with those of the visual hull (`adaptation.stacking`).
         """

@@ -12,24 +12,33 @@ from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork
 from hyperplanes.parameters import Parameters
 
-__all__ = ["grid_gradient", "updated_weights"]
+__all__ = ["grid_gradient", "take_learned_steps", "updated_weights"]
 
 RAYS, PARTS = 2048, 4  # of a step, and into how many parts these are divided, each with other views masked
 ONE_IN = 6  # views that are masked in a part
 
 
 def updated_weights(network: HyperPlanesNetwork, context: SupportContext) -> Parameters:
-    """The weights of an object: theta + delta, and after that the learned steps of `ModelConfig.learned_steps`.
+    """The weights of an object as they are in use: theta + delta, changed by the learned steps.
 
     Args:
         network: the model.
         context: the object.
+    """
+    return take_learned_steps(network, context, network.adapted_weights(context))
+
+
+def take_learned_steps(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> Parameters:
+    """The weights after the steps of `ModelConfig.learned_steps`.
+
+    Args:
+        network: the model.
+        context: the object.
+        weights: to begin with.
 
     Returns:
-        Those of `HyperPlanesNetwork.adapted_weights` where the model has no learned steps, and for an object without
-        masks or of a single view.
+        The same weights where the model has no learned steps, and for an object without masks or of a single view.
     """
-    weights = network.adapted_weights(context)
     step = network.learned_step
     if step is None or context.volume is None or context.views.masks is None or len(context.given) < 2:
         return weights

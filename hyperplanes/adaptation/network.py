@@ -61,7 +61,8 @@ class HyperPlanesNetwork(nn.Module):
                 self.hypernetwork = make_hypernetwork(shape, shapes, reading, volume)
             self.gate = GatingNetwork() if config.gated else None
             self.learned_step: LearnedStep | None = None
-            if config.learned_steps and self.target.volume_size is not None:
+            if config.learned_steps:
+                assert self.target.volume_size is not None  # `check_model`
                 self.learned_step = LearnedStep(*self.target.volume_size, self.theta[GRID].shape[0])
         self.register_buffer("rig", torch.zeros(self.target.rig_size, 3))
 

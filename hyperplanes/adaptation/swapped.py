@@ -10,6 +10,7 @@ import torch
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.learned_steps import take_learned_steps
 from hyperplanes.adaptation.network import in_use
 from hyperplanes.adaptation.stacking import stacked_field
 from hyperplanes.parameters import Parameters
@@ -43,13 +44,14 @@ class Swapped:
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The field of theta plus the update of the object after this one, stacked as with its own update."""
+        """The field of theta plus the update of the object after this one, all else as with its own update."""
         placed = to_canonical_frame(self.model, support)
         prepared = placed.context(self.model)
         known = list(self._updates)
         own = _digest(self.model, support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]
-        return placed.in_scene(stacked_field(self.model, prepared, self.model.theta + self._updates[other]))
+        weights = take_learned_steps(self.model, prepared, self.model.theta + self._updates[other])
+        return placed.in_scene(stacked_field(self.model, prepared, weights))
 
 
 def _digest(model: HyperPlanes, support: Views) -> str:

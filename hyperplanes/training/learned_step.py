@@ -45,7 +45,7 @@ def fit_learned_step(
         on_step: called with the number of steps done and the loss of the last one.
 
     Returns:
-        The network, for a model with `ModelConfig.learned_steps`.
+        The network: the `learned_step` of the model, whose configuration then says how many it takes.
     """
     with seeded(config.seed):
         fitted = HyperPlanesNetwork(replace(model.config, learned_steps=1)).learned_step
