@@ -11,6 +11,7 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext, live_pixels
 from hyperplanes.adaptation.descent import contrast
+from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
@@ -63,7 +64,7 @@ class Trial:
 
     Attributes:
         context: of the views that are shown.
-        learned: the field of one forward pass, without learned steps: with them the views decide alike, and later.
+        learned: its field, after the learned steps and before any fine-tuning.
         pixels: of the others, within the hull of those that are shown.
     """
 
@@ -104,5 +105,5 @@ def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | N
     one, colours, _ = held_out.rays_at(pixels[~uneven], near_far=near_far)
     three, others, _ = held_out.rays_at(pixels[uneven], near_far=near_far, subpixels=SUBPIXELS)
     across = pixels_across(held_out.cameras, held_out.bounds)
-    learned = network.rendering_field(context, network.adapted_weights(context))
+    learned = network.rendering_field(context, updated_weights(network, context))
     return Trial(context, learned, HeldOutPixels(one, three, torch.cat([colours, others]), across))
