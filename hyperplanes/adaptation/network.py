@@ -63,7 +63,7 @@ class HyperPlanesNetwork(nn.Module):
             self.learned_step: LearnedStep | None = None
             if config.learned_steps:
                 assert self.target.volume_size is not None  # `check_model`
-                self.learned_step = LearnedStep(*self.target.volume_size, self.theta[GRID].shape[0])
+                self.learned_step = LearnedStep(self.target.volume_size[1], self.theta[GRID].shape[0])
         self.register_buffer("rig", torch.zeros(self.target.rig_size, 3))
 
     @property

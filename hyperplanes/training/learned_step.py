@@ -26,8 +26,8 @@ from hyperplanes.views import Tasks
 
 __all__ = ["fit_learned_step"]
 
-RAYS = 512  # of the views shown, from which a gradient is found
-SECOND = 0.25  # how often the step that is trained follows another one
+RAYS = 1024  # of the views shown, from which a gradient is found
+STEPS = 4  # the step that is trained is the first of an object, or follows one, two or three others
 RATE, MUON_RATE, WARMUP, LAST = 1e-3, 0.01, 100, 0.02  # rates at first, steps until then, and what they fall to
 
 
@@ -36,10 +36,10 @@ def fit_learned_step(
 ) -> LearnedStep:
     """Train learned steps of a model, whose own weights stay as they are.
 
-    The loss is the squared error of query rays after one step; in a quarter of the draws the second of two.
+    The loss is the squared error of query rays after a step. Of each object drawn, that step is one of the first STEPS.
 
     Args:
-        model: with a hypernetwork that reads a volume; it needs no learned steps yet.
+        model: with a hypernetwork that reads a volume. The training goes on from the learned step that it has, if any.
         data: the objects that it was trained on, or others.
         config: of the episodes, rays and number of the steps; rates and optimisers are those of this module.
         on_step: called with the number of steps done and the loss of the last one.
@@ -50,6 +50,8 @@ def fit_learned_step(
     with seeded(config.seed):
         fitted = HyperPlanesNetwork(replace(model.config, learned_steps=1)).learned_step
     assert fitted is not None
+    if model.learned_step is not None:
+        fitted.load_state_dict(model.learned_step.state_dict())
     fitted = fitted.to(model.rig).requires_grad_()
     optimisers = make_optimisers(list(fitted.parameters()), "muon", RATE, MUON_RATE, betas=(0.9, 0.99))
     rates = [each.param_groups[0]["lr"] for each in optimisers]
@@ -73,31 +75,15 @@ def fit_learned_step(
 
 def _gradients(model: HyperPlanes, fitted: LearnedStep, draws: Sequence[Draw], config: TrainingConfig) -> float:
     """Set the gradients of the network for the objects of a step; returns the mean loss."""
-    contexts = [draw.episode.prepared for draw in draws]
-    theta = model.theta.detach()
     with torch.no_grad():
-        updates = model.updates(contexts)
-    volumes, grids, gradients, errors = [], [], [], []
-    for place, draw in enumerate(draws):
-        error, gradient = _error(model, draw, theta + updates[place])
-        assert draw.episode.prepared.volume is not None
-        volume = draw.episode.prepared.volume
-        if float(torch.rand((), generator=draw.generator)) < SECOND:
-            with torch.no_grad():
-                grid = (theta + updates[place])[GRID]
-                change = fitted(volume[None], grid[None], gradient[None], error[None])[0]
-            updates[place] = updates[place] + {GRID: change}
-            error, gradient = _error(model, draw, theta + updates[place])
-        volumes.append(volume)
-        grids.append((theta + updates[place])[GRID])
-        gradients.append(gradient)
-        errors.append(error)
+        updates = model.updates([draw.episode.prepared for draw in draws])
+    started = [_begun(model, fitted, draw, update) for draw, update in zip(draws, updates, strict=True)]
     with torch.enable_grad():
-        written = fitted(*(torch.stack(each) for each in (volumes, grids, gradients, errors)))
+        written = fitted(*(torch.cat(each) for each in zip(*(read for _, read in started), strict=True)))
     change = written.detach().requires_grad_()
 
     def loss(place: int) -> Tensor:
-        update = updates[place] + {GRID: change[place]}
+        update = started[place][0] + {GRID: change[place]}
         return photometric_loss(forward(model, draws[place], update, config)) / len(draws)
 
     total, (found,) = summed_gradients(loss, len(draws), [change])
@@ -106,7 +92,17 @@ def _gradients(model: HyperPlanes, fitted: LearnedStep, draws: Sequence[Draw], c
     return float(total)
 
 
-def _error(model: HyperPlanes, draw: Draw, weights: Parameters) -> tuple[Tensor, Tensor]:
-    """The error of rays of the views that are shown, and its gradient."""
-    pixels = draw.episode.support_live
-    return grid_gradient(model, draw.episode.prepared, weights, RAYS, draw.generator, pixels=pixels)
+def _begun(
+    model: HyperPlanes, fitted: LearnedStep, draw: Draw, update: Parameters
+) -> tuple[Parameters, tuple[Tensor, Tensor, Tensor]]:
+    """The update of an object after a random number of learned steps, and what the next of them reads."""
+    context = draw.episode.prepared
+    assert context.volume is not None
+    for left in reversed(range(1 + int(torch.randint(STEPS, (), generator=draw.generator)))):
+        weights = model.theta.detach() + update
+        _, gradient = grid_gradient(model, context, weights, RAYS, draw.generator, pixels=draw.episode.support_live)
+        read = context.volume[None, :1], weights[GRID][None], gradient[None]
+        if left:
+            with torch.no_grad():
+                update = update + {GRID: fitted(*read)[0]}
+    return update, read

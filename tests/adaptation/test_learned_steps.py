@@ -74,6 +74,16 @@ def test_steps_lower_the_error_and_are_the_same_each_time():
     assert torch.equal(first, second)
 
 
+@pytest.mark.parametrize(("views", "expected"), [(2, 5), (9, 5), (10, 3), (12, 3)])
+def test_of_many_views_half_as_many_steps_are_taken(views, expected, monkeypatch):
+    taken, adapter = [], stepping(5)
+    context = adapter.prepare(ball_views(ring(views)))
+    own = learned_steps.grid_gradient
+    monkeypatch.setattr(learned_steps, "grid_gradient", lambda *inputs: taken.append(inputs) or own(*inputs))
+    updated_weights(adapter, context)
+    assert len(taken) == expected
+
+
 def changed(adapter, support, **options):
     """Whether learned steps change the weights of an object."""
     context = adapter.prepare(support, **options)
@@ -148,3 +158,26 @@ def test_training_makes_a_step_that_shows_query_views_better_and_leaves_the_mode
         pictures = adapter.adapt(task.support[:3]).render(task.query.cameras).images
         errors.append(float((pictures - task.query.images).square().mean()))
     assert errors[1] < errors[0] - 5e-5
+
+
+def test_training_goes_on_from_the_step_that_the_model_has(monkeypatch):
+    monkeypatch.setattr(training, "RATE", 0.0)
+    monkeypatch.setattr(training, "MUON_RATE", 0.0)
+    adapter = stepping(1)
+    config = TrainingConfig(steps=1, tasks=2, rays=64, views=(2, 3), held_out=0)
+    fitted = fit_learned_step(adapter, Balls(views=6), config)
+    for name, value in adapter.learned_step.state_dict().items():
+        assert torch.equal(fitted.state_dict()[name], value)
+    assert fitted is not adapter.learned_step
+
+
+def test_training_begins_with_each_of_the_first_steps(monkeypatch):
+    """The step that is trained follows none, one, two or three others."""
+    followed, adapter = [], stepping(1)
+    monkeypatch.setattr(
+        training, "grid_gradient", lambda *inputs, **options: followed.append(1) or grid_gradient(*inputs, **options)
+    )
+    config = TrainingConfig(steps=12, tasks=1, rays=64, views=(2, 3), held_out=0)
+    counts = []
+    fit_learned_step(adapter, Balls(views=6), config, on_step=lambda step, loss: counts.append(len(followed)))
+    assert {after - before for before, after in zip([0, *counts], counts, strict=False)} == {1, 2, 3, 4}
