@@ -272,16 +272,16 @@ def test_an_object_that_means_nothing_is_shown_better_than_by_its_hull(count, le
 
 
 def test_learned_steps_bring_decibels_by_the_gradient_that_they_read(monkeypatch):
-    """18.8 dB without, 22.3 with both; by random numbers in place of the gradient 18.1, by its negative 14.8."""
+    """18.8 dB without, 23.1 with four; by random numbers in place of the gradient 16.1, by its negative 12.9."""
     model, task = coarse("small"), shape()
-    found = {"two": mean_psnr(model, task, 3)}
+    found = {"all": mean_psnr(model, task, 3)}
     for name, change in (("random", torch.randn_like), ("negative", torch.neg)):
         monkeypatch.setattr(learned_steps, "grid_gradient", partial(_changed, grid_gradient, change))
         torch.manual_seed(0)
         found[name] = mean_psnr(model, task, 3)
     model.config = replace(model.config, learned_steps=0)
     without = mean_psnr(model, task, 3)
-    assert found["two"] > without + 2
+    assert found["all"] > without + 2
     assert found["random"] < without + 0.2
     assert found["negative"] < without - 1
 

@@ -10,7 +10,7 @@ from hyperplanes.adaptation.context import SupportContext, trained_on
 from hyperplanes.adaptation.descent import pixels_of, ray_loss
 from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork
-from hyperplanes.configuration.fine_tuning import MANY_VIEWS
+from hyperplanes.configuration.fine_tuning import FINE_VIEWS
 from hyperplanes.parameters import Parameters
 
 __all__ = ["grid_gradient", "take_learned_steps", "updated_weights"]
@@ -32,7 +32,7 @@ def updated_weights(network: HyperPlanesNetwork, context: SupportContext) -> Par
 def take_learned_steps(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> Parameters:
     """The weights after the steps of `ModelConfig.learned_steps`.
 
-    With MANY_VIEWS given views or more they are half as many: more bring nothing there (docs/image-based.md).
+    With FINE_VIEWS given views or more they are half as many: more bring nothing there (docs/image-based.md).
 
     Args:
         network: the model.
@@ -46,7 +46,7 @@ def take_learned_steps(network: HyperPlanesNetwork, context: SupportContext, wei
     if step is None or context.volume is None or context.views.masks is None or len(context.given) < 2:
         return weights
     steps, generator = network.config.learned_steps, torch.Generator().manual_seed(0)
-    for _ in range(steps if len(context.given) < MANY_VIEWS else -(-steps // 2)):
+    for _ in range(steps if len(context.given) < FINE_VIEWS else -(-steps // 2)):
         _, gradient = grid_gradient(network, context, weights, RAYS, generator)
         with torch.no_grad():
             change = step(context.volume[None, :1], weights[GRID][None], gradient[None])[0]

@@ -26,7 +26,7 @@ FRESH = 0.5
 
 CELLS, FINE_VIEWS = 64, 20
 """Cells an axis of the grid of features that fine-tuning optimises with so many support views or more; hypernetworks
-write half as many (docs/adaptation.md)."""
+write half as many (docs/adaptation.md). Of so many views half as many learned steps are taken (docs/image-based.md)."""
 
 MANY_VIEWS = 10
 """Support views of a field of any number of them from which on fine-tuning begins with weights that are partly random,

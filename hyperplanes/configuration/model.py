@@ -56,7 +56,7 @@ class ModelConfig:
         gated: a gating network makes a share of every pixel of that one (`adaptation.gating`); `training.gating` trains
             it after the model. With ten given views or more it also mixes the hull into pictures after gradient steps.
         learned_steps: steps of gradient descent that a network takes after the forward pass
-            (`adaptation.learned_steps`), half as many from ten views on; `training.learned_step` trains it after the
+            (`adaptation.learned_steps`), half as many from twenty views on; `training.learned_step` trains it after the
             model.
         symmetric: views of an object that looks symmetric are shown to the model together with their reflections
             (`adaptation.symmetry`). Training does without.
