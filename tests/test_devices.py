@@ -91,11 +91,16 @@ def test_gradient_steps_end_with_the_same_weights(device):
 
 
 def test_rays_that_end_where_they_are_opaque_are_shown_alike(device):
-    """On the CPU in rounds, until little light is left; elsewhere all samples at once, with gradients or without."""
+    """On the CPU in rounds, until little light is left; elsewhere all samples at once, with gradients or without.
+
+    The weights are those of the forward pass: learned steps read gradients of such rays, and end 1.5 % apart.
+    """
     pixels = []
     for where in (CPU, device):
         task = car(where)
-        field = small(where, stop=5e-3).adapt(task.support)
+        model = small(where, stop=5e-3)
+        model.config = replace(model.config, learned_steps=0)
+        field = model.adapt(task.support)
         rays, _ = task.query.sample_rays(150, generator=torch.Generator().manual_seed(0))
         placed = len(field.sampling.place(rays, field.occupancy))
         drawn = torch.Generator().manual_seed(1)
@@ -104,7 +109,7 @@ def test_rays_that_end_where_they_are_opaque_are_shown_alike(device):
         pixels.append([each.colour.detach().cpu() for each in found])
         assert found[0].samples == placed if where == device else found[0].samples < placed
     for here, there in zip(*pixels, strict=True):
-        assert float((here - there).square().mean()) < 1e-5
+        assert float((here - there).square().mean()) < 1e-6
 
 
 def test_planes_of_symmetry_are_found(device):
