@@ -13,7 +13,7 @@ from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork
 from hyperplanes.configuration.fine_tuning import FINE_VIEWS
 from hyperplanes.parameters import Parameters
 
-__all__ = ["grid_gradient", "take_learned_steps", "updated_weights"]
+__all__ = ["grid_gradient", "step_inputs", "take_learned_steps", "updated_weights"]
 
 RAYS, PARTS = 2048, 4  # of a step, and into how many parts these are divided, each with other views masked
 ONE_IN = 6  # views that are masked in a part
@@ -47,11 +47,34 @@ def take_learned_steps(network: HyperPlanesNetwork, context: SupportContext, wei
         return weights
     steps, generator = network.config.learned_steps, torch.Generator().manual_seed(0)
     for _ in range(steps if len(context.given) < FINE_VIEWS else -(-steps // 2)):
-        _, gradient = grid_gradient(network, context, weights, RAYS, generator)
+        inputs = step_inputs(network, context, weights, RAYS, generator)
         with torch.no_grad():
-            change = step(context.volume[None, :1], weights[GRID][None], gradient[None])[0]
-        weights = weights + {GRID: change}
+            weights = weights + {GRID: step(*inputs)[0]}
     return weights
+
+
+def step_inputs(
+    network: HyperPlanesNetwork,
+    context: SupportContext,
+    weights: Parameters,
+    rays: int,
+    generator: torch.Generator,
+    *,
+    pixels: Int[Tensor, " pixel"] | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What a `LearnedStep` reads of an object: hull, grid and gradient, as of one of several objects.
+
+    Args:
+        network: the model, whose hypernetwork reads a volume.
+        context: the object.
+        weights: of its field.
+        rays: as in `grid_gradient`, and so the others.
+        generator: of views, rays and samples.
+        pixels: that rays are drawn from.
+    """
+    assert context.volume is not None
+    gradient = grid_gradient(network, context, weights, rays, generator, pixels=pixels)
+    return context.volume[None, :1], weights[GRID][None], gradient[None]
 
 
 def grid_gradient(
@@ -62,8 +85,8 @@ def grid_gradient(
     generator: torch.Generator,
     *,
     pixels: Int[Tensor, " pixel"] | None = None,
-) -> tuple[Tensor, Float[Tensor, "feature x y z"]]:
-    """The error of random rays of the views of an object, and its gradient in the grid of features.
+) -> Float[Tensor, "feature x y z"]:
+    """The gradient of the mean squared error of random rays of the views of an object, in the grid of features.
 
     The field is not shown the views that rays come from, as in fine-tuning.
 
@@ -76,7 +99,7 @@ def grid_gradient(
         pixels: flat indices of those that rays are drawn from; found where absent.
 
     Returns:
-        The mean squared error, and the gradient; zeros where no ray meets the object.
+        The gradient; zeros where no ray meets the object.
     """
     views = trained_on(context, context.given)
     if pixels is None:
@@ -98,8 +121,8 @@ def grid_gradient(
         return ray_loss(field.trace(drawn, generators[part]), truth) / len(parts)
 
     thread_safe = network.field(context, variable).thread_safe
-    error, (gradient,) = summed_gradients(loss, len(parts), [grid], thread_safe=thread_safe)
-    return error, torch.zeros_like(grid) if gradient is None else gradient
+    _, (gradient,) = summed_gradients(loss, len(parts), [grid], thread_safe=thread_safe)
+    return torch.zeros_like(grid) if gradient is None else gradient
 
 
 def _masked(count: int, generator: torch.Generator) -> list[Int[Tensor, " masked"]]:

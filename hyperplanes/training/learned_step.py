@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.learned_steps import grid_gradient
+from hyperplanes.adaptation.learned_steps import step_inputs
 from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork, in_use
 from hyperplanes.adaptation.optimisers import make_optimisers
 from hyperplanes.configuration.training import TrainingConfig
@@ -77,9 +77,9 @@ def _gradients(model: HyperPlanes, fitted: LearnedStep, draws: Sequence[Draw], c
     """Set the gradients of the network for the objects of a step; returns the mean loss."""
     with torch.no_grad():
         updates = model.updates([draw.episode.prepared for draw in draws])
-    started = [_begun(model, fitted, draw, update) for draw, update in zip(draws, updates, strict=True)]
+    started = [_after_others(model, fitted, draw, update) for draw, update in zip(draws, updates, strict=True)]
     with torch.enable_grad():
-        written = fitted(*(torch.cat(each) for each in zip(*(read for _, read in started), strict=True)))
+        written = fitted(*(torch.cat(each) for each in zip(*(inputs for _, inputs in started), strict=True)))
     change = written.detach().requires_grad_()
 
     def loss(place: int) -> Tensor:
@@ -92,17 +92,17 @@ def _gradients(model: HyperPlanes, fitted: LearnedStep, draws: Sequence[Draw], c
     return float(total)
 
 
-def _begun(
+def _after_others(
     model: HyperPlanes, fitted: LearnedStep, draw: Draw, update: Parameters
 ) -> tuple[Parameters, tuple[Tensor, Tensor, Tensor]]:
     """The update of an object after a random number of learned steps, and what the next of them reads."""
-    context = draw.episode.prepared
-    assert context.volume is not None
-    for left in reversed(range(1 + int(torch.randint(STEPS, (), generator=draw.generator)))):
-        weights = model.theta.detach() + update
-        _, gradient = grid_gradient(model, context, weights, RAYS, draw.generator, pixels=draw.episode.support_live)
-        read = context.volume[None, :1], weights[GRID][None], gradient[None]
-        if left:
-            with torch.no_grad():
-                update = update + {GRID: fitted(*read)[0]}
-    return update, read
+    episode, theta = draw.episode, model.theta.detach()
+
+    def inputs() -> tuple[Tensor, Tensor, Tensor]:
+        return step_inputs(model, episode.prepared, theta + update, RAYS, draw.generator, pixels=episode.support_live)
+
+    for _ in range(int(torch.randint(STEPS, (), generator=draw.generator))):
+        read = inputs()
+        with torch.no_grad():
+            update = update + {GRID: fitted(*read)[0]}
+    return update, inputs()

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes, learned_steps
-from hyperplanes.adaptation.learned_steps import PARTS, grid_gradient, take_learned_steps, updated_weights
+from hyperplanes.adaptation.learned_steps import PARTS, grid_gradient, step_inputs, take_learned_steps, updated_weights
 from hyperplanes.adaptation.network import GRID
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.training import TrainingConfig
@@ -29,17 +29,32 @@ def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
+def error_and_gradient(adapter, context, weights, rays, seed=0):
+    """The error whose gradient is found, and the gradient."""
+    errors, find = [], learned_steps.summed_gradients
+
+    def kept(*inputs, **options):
+        error, gradients = find(*inputs, **options)
+        errors.append(float(error))
+        return error, gradients
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learned_steps, "summed_gradients", kept)
+        gradient = grid_gradient(adapter, context, weights, rays, generator(seed))
+    return errors[0], gradient
+
+
 def test_the_gradient_is_that_of_the_error():
     adapter = stepping().double()
     context = adapter.prepare(ball_views(ring(5)))
     weights = adapter.adapted_weights(context)
-    error, gradient = grid_gradient(adapter, context, weights, 512, generator())
+    error, gradient = error_and_gradient(adapter, context, weights, 512)
     assert gradient.shape == weights[GRID].shape
     change = gradient / gradient.norm()
     ahead, behind = (
-        grid_gradient(adapter, context, weights + {GRID: step * change}, 512, generator())[0] for step in (1e-3, -1e-3)
+        error_and_gradient(adapter, context, weights + {GRID: step * change}, 512)[0] for step in (1e-3, -1e-3)
     )
-    assert float(ahead - behind) / 2e-3 == pytest.approx(float(gradient.norm()), rel=1e-3)
+    assert (ahead - behind) / 2e-3 == pytest.approx(float(gradient.norm()), rel=1e-3)
     assert error > 0
 
 
@@ -66,7 +81,7 @@ def test_steps_lower_the_error_and_are_the_same_each_time():
     adapter, support = stepping(3), ball_views(ring(6))
     context = adapter.prepare(support)
     errors = [
-        grid_gradient(adapter, context, weights, 4096, generator(9))[0]
+        error_and_gradient(adapter, context, weights, 4096, seed=9)[0]
         for weights in (adapter.adapted_weights(context), updated_weights(adapter, context))
     ]
     assert errors[1] < errors[0] - 1e-5
@@ -78,8 +93,7 @@ def test_steps_lower_the_error_and_are_the_same_each_time():
 def test_of_many_views_half_as_many_steps_are_taken(views, expected, monkeypatch):
     taken, adapter = [], stepping(5)
     context = adapter.prepare(ball_views(ring(views)))
-    own = learned_steps.grid_gradient
-    monkeypatch.setattr(learned_steps, "grid_gradient", lambda *inputs: taken.append(inputs) or own(*inputs))
+    monkeypatch.setattr(learned_steps, "step_inputs", lambda *inputs: taken.append(1) or step_inputs(*inputs))
     updated_weights(adapter, context)
     assert len(taken) == expected
 
@@ -175,7 +189,7 @@ def test_training_begins_with_each_of_the_first_steps(monkeypatch):
     """The step that is trained follows none, one, two or three others."""
     followed, adapter = [], stepping(1)
     monkeypatch.setattr(
-        training, "grid_gradient", lambda *inputs, **options: followed.append(1) or grid_gradient(*inputs, **options)
+        training, "step_inputs", lambda *inputs, **options: followed.append(1) or step_inputs(*inputs, **options)
     )
     config = TrainingConfig(steps=12, tasks=1, rays=64, views=(2, 3), held_out=0)
     counts = []
