@@ -11,14 +11,14 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.geometry.chosen_views import Penalties, Reading
-from hyperplanes.geometry.hull_hits import hull_hits
+from hyperplanes.geometry.hull_hits import centres_in_hull, hull_hits
 from hyperplanes.geometry.occupancy import LARGEST_SIDE, Occupancy
 from hyperplanes.geometry.poses import Count
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.rendering.renderer import RayMarching
-from hyperplanes.rendering.samplers import PackedSamples
+from hyperplanes.rendering.samplers import OpaqueSamples, PackedSamples
 from hyperplanes.utilities.arguments import checked, checked_fields
 from hyperplanes.views import Views
 
@@ -27,7 +27,6 @@ __all__ = ["HullBlend", "blend_views"]
 OPAQUE = 1e4  # density within the hull, per radius of the scene
 STOP = 2e-3  # transmittance; so low that every sample is evaluated: by every second one wings lose 0.05 to 0.5 dB
 SOLID = 0.5  # opacity of a mask from which on a pixel shows the object
-POINTS = 1 << 14  # in one call of the density
 ROUNDING = 1e-4  # of an opacity, by which kernels differ: without it 5 of 424,000 samples in the hull were holes
 
 
@@ -81,11 +80,10 @@ class HullBlend:
         """
         region, blend = planes.occupancy, _Blend(planes, planes.occupancy.bounds, self.nearest)
         # voxels whose centre lies in the hull: by all that it enters views would see its surface too near
-        depth = torch.zeros_like(region.occupied, dtype=torch.float32)
-        centres = region.centres().to(planes.maps).split(POINTS)
-        depth[region.occupied] = torch.cat([blend.density(each) for each in centres]).float() * region.voxel
+        inside = centres_in_hull(planes, SOLID - ROUNDING)
+        depth = inside.occupied * (2 * OPAQUE / len(region.occupied))
         voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
-        blend = replace(blend, planes=planes.with_penalties(Penalties.alike()).with_surface(voxels.solid()))
+        blend = replace(blend, planes=planes.with_penalties(Penalties.alike()).with_surface(inside))
         sampling = _FirstInHull(self.steps, STOP, planes=planes)
         return AdaptedField(blend, region, sampling, densities=(blend.density,), refined=voxels)
 
@@ -136,18 +134,7 @@ class _FirstInHull(RayMarching):
         step = 2 * occupancy.bounds.radius / self.steps
         distances = hull_hits(self.planes, rays, rays.near + step / 2, step, occupancy, SOLID)
         ray = distances.isfinite().nonzero()[:, 0]
-        return PackedSamples(ray, distances[ray], step)
-
-
-@dataclass(frozen=True)
-class _HullPoints:
-    """Points, and their density."""
-
-    points: Float[Tensor, "point 3"]
-    density: Float[Tensor, " point"]
-
-    def __getitem__(self, index: slice | Tensor) -> _HullPoints:
-        return _HullPoints(self.points[index], self.density[index])
+        return OpaqueSamples(ray, distances[ray], step)
 
 
 @dataclass(frozen=True)
@@ -176,14 +163,16 @@ class _Blend:
         coverage = self.planes.choose(points, best=0).coverage
         return torch.where(coverage < SOLID - ROUNDING, 0.0, OPAQUE / self.bounds.radius)
 
-    def hidden(self, points: Float[Tensor, "point 3"]) -> _HullPoints:
-        """All that is expensive about the density of a point."""
-        return _HullPoints(points, self.density(points))
+    def hidden(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """The points: densities and colours have nothing in common."""
+        return points
 
-    def density_of(self, hidden: _HullPoints) -> Float[Tensor, " point"]:
+    def density_of(self, hidden: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """The density."""
-        return hidden.density
+        return self.density(hidden)
 
-    def colour_of(self, hidden: _HullPoints, directions: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+    def colour_of(
+        self, hidden: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> Float[Tensor, "point 3"]:
         """The blended colours."""
-        return blend_views(self.planes, hidden.points, directions, self.nearest)
+        return blend_views(self.planes, hidden, directions, self.nearest)

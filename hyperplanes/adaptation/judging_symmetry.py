@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
+from hyperplanes.adaptation.context import live_pixels
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.reflections import HULL_SIDE, SHOWN, images_by
 from hyperplanes.geometry.kernels.threads import side_by_side
 from hyperplanes.geometry.occupancy import Occupancy, carve
-from hyperplanes.geometry.rays import Sphere
+from hyperplanes.geometry.rays import Rays, Sphere, join_rays
 from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering.footprint import footprint
+from hyperplanes.rendering.images import EDGE, EDGE_SUBPIXELS, pixels_at_edges
 from hyperplanes.views import Views
 
 __all__ = ["TOLERANCE", "SymmetryJudge", "best_vertical_plane", "carved"]
 
 SIZE, COARSE_SIZE = 64, 32  # pixels of views along the longer side, at most: to judge a plane, and to look for one
 COARSE_HULL = 48  # voxels an axis, to look for one
+STEPS = 2  # of rays in a voxel
 AZIMUTHS = 24  # of vertical planes that are tried
 NEARLY = 1.5  # times the error of the best of these, up to which better ones are looked for near to the second, too
 COARSE_ROUNDS, FINE_ROUNDS = 3, 2  # of looking for better ones
@@ -38,18 +43,53 @@ WORTH = 0.5  # power of the order by which the error may grow
 
 
 @dataclass(frozen=True)
+class _PixelRays:
+    """Rays through pixels of views as pictures are rendered, which are cast once: five where the views have an edge.
+
+    Attributes:
+        rays: of all pixels.
+        pixels: that each goes through, as flat indices (view, row, column).
+        shares: of each in its pixel.
+    """
+
+    rays: Rays
+    pixels: Int[Tensor, " ray"]
+    shares: Float[Tensor, " ray"]
+
+    @classmethod
+    def of(cls, views: Views, pixels: Int[Tensor, " pixel"]) -> _PixelRays:
+        """The rays of pixels of views with masks."""
+        assert views.masks is not None
+        # an edge of a picture that was scaled down is two pixels wide, each of which differs half as much
+        values = torch.cat([views.images, views.masks], 1).permute(0, 2, 3, 1)
+        edges = pixels[pixels_at_edges(values, EDGE / 2).flatten()[pixels]]
+        centres, _, _ = views.rays_at(pixels)
+        others, _, _ = views.rays_at(edges, subpixels=EDGE_SUBPIXELS[1:])
+        through = torch.cat([pixels, edges.repeat(len(EDGE_SUBPIXELS) - 1)])
+        return cls(join_rays(centres, others), through, 1 / through.bincount()[through])
+
+    def picture(self, colours: Float[Tensor, "ray 3"], shape: torch.Size) -> Float[Tensor, "view 3 height width"]:
+        """The means of the colours of rays in masks of a shape (view, 1, height, width); white elsewhere."""
+        found = colours.new_ones(shape.numel(), 3).index_fill_(0, self.pixels, 0.0)
+        found.index_add_(0, self.pixels, colours * self.shares[:, None])
+        return found.unflatten(0, (shape[0], *shape[2:])).permute(0, 3, 1, 2)
+
+
+@dataclass(frozen=True)
 class SymmetryJudge:
     """How well views are shown by `HullBlend` of them and their reflections.
 
     Attributes:
         views: small ones.
         voxels: their visual hull.
-        alone: their squared error without reflections, and FLOOR.
+        rays: through the pixels of the views that may show it.
+        alone: squared error without reflections, and FLOOR.
         floor: of all errors.
     """
 
     views: Views
     voxels: Occupancy
+    rays: _PixelRays
     alone: float
     floor: float
 
@@ -59,7 +99,8 @@ class SymmetryJudge:
         views = support.resized(size)
         assert views.masks is not None
         voxels, floor = carved(views, side), FLOOR * float((views.masks >= SHOWN).sum())
-        return cls(views, voxels, _squared_error(views, None, voxels) + floor, floor)
+        judge = cls(views, voxels, _PixelRays.of(views, live_pixels(voxels, views)), 1.0, floor)
+        return replace(judge, alone=judge.squared_error(None) + floor)
 
     def errors(self, planes: Sequence[Plane], most: float = math.inf) -> dict[Plane, float]:
         """Those of the planes by which they are at most so large, and finite."""
@@ -100,7 +141,32 @@ class SymmetryJudge:
 
     def error(self, symmetry: Symmetry) -> float:
         """That of the hull of views and reflections; infinite where it loses too many pixels."""
-        return (_squared_error(self.views, symmetry, self.voxels) + self.floor) / self.alone
+        return (self.squared_error(symmetry) + self.floor) / self.alone
+
+    def squared_error(self, symmetry: Symmetry | None) -> float:
+        """That of the views by `HullBlend` of them and their reflections.
+
+        Args:
+            symmetry: of the reflections, if there are any.
+
+        Returns:
+            The sum over pixels; infinite where the hull with reflections loses too many of them.
+        """
+        views, shown, voxels = self.views, self.views, self.voxels
+        assert views.masks is not None
+        among = torch.ones_like(views.masks, dtype=torch.bool)
+        if symmetry is not None:
+            shown = images_by(views, symmetry)
+            voxels = carved(shown[len(views) :], len(voxels.occupied), voxels)
+            seen, held = views.masks >= SHOWN, footprint(voxels, views.cameras)[:, None]
+            if not voxels.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
+                return math.inf
+            among = held | ~seen
+        assert shown.masks is not None
+        planes = VisibilityPlanes(shown.images, shown.cameras, shown.masks, voxels)
+        blend = HullBlend(steps=STEPS * len(voxels.occupied)).adapt_to(planes)
+        found = self.rays.picture(blend.trace(self.rays.rays, differentiable=False).colour, views.masks.shape)
+        return float((found - views.images).square().mean(1, keepdim=True)[among].sum())
 
 
 def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
@@ -161,26 +227,3 @@ def _refined(
 def _vertical(bounds: Sphere, angle: float, offset: float = 0.0) -> Plane:
     """The vertical plane whose normal has this azimuth, so many radii from the middle of a scene."""
     return Plane.of_sphere(bounds, (math.cos(angle), 0.0, math.sin(angle)), offset)
-
-
-def _squared_error(views: Views, symmetry: Symmetry | None, voxels: Occupancy) -> float:
-    """That of views by `HullBlend` of them and their reflections; infinite where their hull loses too many pixels.
-
-    Args:
-        views: with masks.
-        symmetry: of the reflections, if there are any.
-        voxels: the visual hull of the views alone.
-    """
-    assert views.masks is not None
-    shown, among = views, torch.ones_like(views.masks, dtype=torch.bool)
-    if symmetry is not None:
-        shown = images_by(views, symmetry)
-        voxels = carved(shown[len(views) :], len(voxels.occupied), voxels)
-        seen, held = views.masks >= SHOWN, footprint(voxels, views.cameras)[:, None]
-        if not voxels.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
-            return math.inf
-        among = held | ~seen
-    assert shown.masks is not None
-    blend = HullBlend().adapt_to(VisibilityPlanes(shown.images, shown.cameras, shown.masks, voxels))
-    found = blend.render(views.cameras)
-    return float((found.images - views.images).square().mean(1, keepdim=True)[among].sum())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Int
@@ -13,7 +13,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.baking import BakedScene
 from hyperplanes.fields.baked import BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.rays import Rays
+from hyperplanes.geometry.rays import Rays, join_rays
 from hyperplanes.rendering.images import EDGE_SUBPIXELS, pixels_at_edges
 from hyperplanes.rendering.voxels import voxel_gradients
 from hyperplanes.utilities.uncompiled_optimisers import Adam
@@ -156,14 +156,10 @@ class _Source:
         others, _, _ = self.views.rays_at(self.live[drawn[at_edge]], subpixels=EDGE_SUBPIXELS[1:])
         pixel = torch.arange(len(drawn))
         order = torch.cat([pixel, pixel[at_edge].repeat(len(EDGE_SUBPIXELS) - 1)]).argsort(stable=True)
-        return _joined([centre, others])[order], truth, counts
+        return join_rays(centre, others)[order], truth, counts
 
 
 def _draw(sources: Sequence[_Source], generator: torch.Generator) -> tuple[Rays, Tensor, Tensor]:
     """As `_Source.draw`, of all sources."""
     rays, truth, counts = zip(*(source.draw(generator) for source in sources if source.pixels), strict=True)
-    return _joined(rays), torch.cat(truth), torch.cat(counts)
-
-
-def _joined(parts: Sequence[Rays]) -> Rays:
-    return Rays(*(torch.cat([getattr(part, each.name) for part in parts]) for each in fields(Rays)))
+    return join_rays(*rays), torch.cat(truth), torch.cat(counts)

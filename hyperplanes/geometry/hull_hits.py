@@ -1,6 +1,8 @@
-"""Where rays first meet the visual hull of masks, and not only a voxel that it enters."""
+"""The visual hull of masks itself, and not only the voxels that it enters: where rays meet it, and what lies in it."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,9 +15,10 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.geometry.visibility import VisibilityPlanes
 
-__all__ = ["hull_hits"]
+__all__ = ["centres_in_hull", "hull_hits"]
 
-RAYS = 512  # that one call of the kernel works on
+RAYS, LAYERS = 512, 2  # of rays and of voxels, that one call of a kernel works on
+POINTS = 1 << 14  # in one call, without a compiler
 
 
 @torch.no_grad()
@@ -52,3 +55,28 @@ def hull_hits(
     kernel = compile_kernel("hull_hits.hull_hits", torch.float32)
     parallel_for(lambda a, b: kernel(*fixed, nearest.numpy(), a, b), len(rays), RAYS)
     return nearest
+
+
+@torch.no_grad()
+def centres_in_hull(planes: VisibilityPlanes, opacity: float) -> Occupancy:
+    """The occupied voxels of the planes whose centres lie in the hull.
+
+    Args:
+        planes: the views whose masks are the hull, and voxels that it enters.
+        opacity: that every view which shows a centre has there at least.
+    """
+    voxels, occupied = planes.occupancy, planes.occupancy.occupied.clone()
+    if not planes.has_kernels(planes.maps):
+        points = voxels.centres().to(planes.maps).split(POINTS)
+        occupied[voxels.occupied] = torch.cat([planes.choose(each, best=0).coverage >= opacity for each in points])
+        return replace(voxels, occupied=occupied)
+    cameras, shape, bounds = planes.shown_cameras(), planes.maps.shape, voxels.bounds
+    occupied = occupied.contiguous()
+    fixed = (
+        *(each.contiguous().flatten().numpy() for each in (cameras, planes.maps)), (*shape[:3], cameras.shape[1]),
+        np.asarray(bounds.centre, np.float32) - np.float32(bounds.radius), np.float32(voxels.voxel),
+        np.array([planes.colours.nearest, opacity], np.float32), occupied.numpy().view(np.uint8),
+    )  # fmt: skip
+    kernel = compile_kernel("hull_centres.centres", torch.float32)
+    parallel_for(lambda a, b: kernel(*fixed, a, b), len(occupied), LAYERS)
+    return replace(voxels, occupied=occupied)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from hyperplanes.geometry.inputs import ArrayLike, as_tensor, check_indices
 from hyperplanes.utilities.arguments import checked, checked_fields, kind_of
 from hyperplanes.utilities.precision import without_autocast
 
-__all__ = ["SUBPIXELS", "Rays", "Sphere", "cast", "pixel_grid"]
+__all__ = ["SUBPIXELS", "Rays", "Sphere", "cast", "join_rays", "pixel_grid"]
 
 SUBPIXELS = ((0.0, 0.0), (-0.25, -0.25), (0.25, 0.25))
 """Places in a pixel, from its centre, whose rays have the mean of its area as their mean, nearly: those of training."""
@@ -82,6 +82,11 @@ class Rays:
         """The points at distances t."""
         shape = (len(self),) + (1,) * (t.ndim - 1) + (3,)
         return self.origins.reshape(shape) + t[..., None] * self.directions.reshape(shape)
+
+
+def join_rays(first: Rays, *others: Rays) -> Rays:
+    """Several sets of rays as one, in their order."""
+    return Rays(*(torch.cat([getattr(part, each.name) for part in (first, *others)]) for each in fields(Rays)))
 
 
 def pixel_grid(height: int, width: int, device: torch.device | str | None = None) -> Float[Tensor, "pixel 2"]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
-from hyperplanes.rendering.samplers import DenseSamples, PackedSamples, Sampler
+from hyperplanes.rendering.samplers import DenseSamples, OpaqueSamples, PackedSamples, Sampler
 from hyperplanes.rendering.scene import (
     FieldFunction,
     Scene,
@@ -57,6 +57,8 @@ def integrate(
     if isinstance(samples, DenseSamples):
         return _coarse_to_fine(scene, rays, sampler, samples, generator, differentiable)
     if not differentiable:
+        if isinstance(samples, OpaqueSamples) and scene.proposal is None:
+            return _at_surface(scene, rays, samples)
         return _front_to_back(scene, rays, samples, sampler.stop)
     if generator is None or sampler.stop == 0 or not _has_importance(scene, samples):
         return _all_at_once(scene, rays, samples)
@@ -112,6 +114,19 @@ def _all_at_once(scene: Scene, rays: Rays, samples: PackedSamples) -> Rendered:
     alone = rank[even] + 1 == total[samples.ray[even]]
     coarse = composited(scene.proposal, samples[even], torch.where(alone, 1, 2) * samples.step)
     return replace(fine, samples=fine.samples + coarse.samples, coarse=coarse)
+
+
+def _at_surface(scene: Scene, rays: Rays, samples: OpaqueSamples) -> Rendered:
+    """The pixels of rays that end at their samples."""
+    points, directions = _packed_points(rays, samples)
+    if isinstance(scene.field, SplitField):
+        batches = zip(*(each.split(points_per_batch(points.device)) for each in (points, directions)), strict=True)
+        found = [scene.field.colour_of(scene.field.hidden(place), along) for place, along in batches]
+        colour = torch.cat([rays.origins.new_zeros(0, 3), *found])
+    else:
+        colour, _ = evaluate(scene.field, points, directions, differentiable=False)
+    whole = torch.ones_like(samples.distances)
+    return composite_packed(colour, whole, samples.distances, samples.ray, len(rays), scene.background)
 
 
 def _has_importance(scene: Scene, samples: PackedSamples) -> bool:

@@ -15,7 +15,7 @@ from torch import Tensor
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays
 
-__all__ = ["DenseSamples", "PackedSamples", "Sampler"]
+__all__ = ["DenseSamples", "OpaqueSamples", "PackedSamples", "Sampler"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,10 @@ class PackedSamples:
 
     def __getitem__(self, index: slice | Tensor) -> PackedSamples:
         return PackedSamples(self.ray[index], self.distances[index], self.step)
+
+
+class OpaqueSamples(PackedSamples):
+    """Samples that hide all that lies behind them, at most one a ray: their densities need not be evaluated."""
 
 
 @runtime_checkable

@@ -11,6 +11,7 @@ from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry import Sphere, against
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
 from hyperplanes.geometry.chosen_views import ANGLE
+from hyperplanes.geometry.hull_hits import centres_in_hull
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.rendering import RayMarching
@@ -164,6 +165,19 @@ def test_a_view_that_is_hidden_cuts_nothing_away(monkeypatch):
     monkeypatch.setattr(VisibilityPlanes, "has_kernels", lambda self, points: False)
     torch.testing.assert_close(opacity, SMALL.adapt_to(hidden).render(cameras).opacity, atol=1e-4, rtol=0)
     assert opacity.max() == 1
+
+
+@pytest.mark.parametrize("masked", [[], [2]])
+def test_centres_of_voxels_lie_in_the_hull_where_every_view_shows_the_object(masked):
+    """By the kernel, and by the least opacity over the views of each centre; some views end within the scene."""
+    views = ball_views(ring(5, (24, 20), angle=0.5), radius=0.6)
+    planes = VisibilityPlanes(views.images, views.cameras, views.masks, full(Sphere((0.1, 0.0, -0.1), 1.2), 19))
+    planes = planes.mask_views(torch.tensor(masked, dtype=torch.long))
+    inside = centres_in_hull(planes, 0.5).occupied.flatten()
+    coverage = planes.choose(planes.occupancy.centres(), best=0).coverage
+    clear = (coverage - 0.5).abs() > 1e-4
+    assert torch.equal(inside[clear], (coverage > 0.5)[clear])
+    assert 0.02 < inside.float().mean() < 0.5
 
 
 def test_where_no_view_sees_a_point_the_nearest_serve_whatever_hides_it():

@@ -134,13 +134,13 @@ def test_the_second_best_azimuth_is_followed_where_its_error_is_nearly_as_small(
     """A narrow minimum lies between two azimuths that are tried, a broad one, not so deep, at a third one."""
     views, degrees = balls(cameras(3), BODY), 180 / judging_symmetry.AZIMUTHS
 
-    def error(views, by, side):
+    def error(_, by):
         if by is None:
             return 1.0
         angle = math.degrees(math.atan2(by.plane.normal[2], by.plane.normal[0])) % 180
         return min(6 + 0.5 * abs(angle - 4 * degrees), 1 + abs(angle - 12.5 * degrees) * 12 / degrees)
 
-    monkeypatch.setattr(judging_symmetry, "_squared_error", error)
+    monkeypatch.setattr(judging_symmetry.SymmetryJudge, "squared_error", error)
     judge = judging_symmetry.SymmetryJudge.of(views)
     found = judging_symmetry.best_vertical_plane(judge, views)
     assert math.degrees(math.atan2(found.normal[2], found.normal[0])) == pytest.approx(12.5 * degrees, abs=0.5)

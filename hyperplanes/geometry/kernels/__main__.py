@@ -14,6 +14,7 @@ RENDERING = {
     "visibility.choose": "",
     "carving.carve": "",
     "hull_hits.hull_hits": "",
+    "hull_centres.centres": "",
     "marching.march": "",
     "first_hits.first_hits": "",
     "footprints.footprints": "",

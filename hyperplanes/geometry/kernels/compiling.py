@@ -57,6 +57,7 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T[::1], uint8[:, :, ::1], T[::1], T[::1], "
         "UniTuple(int64, 4), T[::1], T[::1], int64, int64"
     ),
+    "hull_centres.centres": ("T[::1], T[::1], UniTuple(int64, 4), T[::1], T, T[::1], uint8[:, :, ::1], int64, int64"),
     "first_hits.first_hits": (
         "T[:, ::1], T[:, :, :, ::1], T[:, :, :], T[::1], T, T[::1], uint8[:, :, ::1], T[:, :, ::1], int64, int64"
     ),
