@@ -847,6 +847,7 @@ def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tm
     assert "nerf " in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("few_rays")
 def test_the_scene_that_comes_with_the_package_has_a_name(tmp_path, monkeypatch, capsys):
     task, up = read_scene(Path("example-car"), Console(silent=True))
     assert (len(task.support), len(task.query), task.name, up) == (25, 25, "example-car", "y")
@@ -949,9 +950,7 @@ def test_the_demonstration_reads_meshes_before_it_renders_classes(tmp_path):
 
 def test_the_demonstration_shows_the_packaged_model_before_anything_is_trained(tmp_path, capsys):
     page = (demo_folder() / "first.html").read_text(encoding="utf-8")
-    assert all(
-        words in page for words in ("2 views", "3 views", "car_test_00000", "lamp_test_00000", "data:image/webp")
-    )
+    assert all(words in page for words in ("3 views", "car_test_00000", "data:image/webp"))
     assert "How it learned" not in page
     assert (
         main(["demo", "--quick-check", "--first-only", "--meshes", str(tmp_path), "--out", str(tmp_path / "out")]) == 2

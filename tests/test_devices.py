@@ -26,7 +26,10 @@ from hyperplanes.views import Task
 
 CPU = torch.device("cpu")
 HAS_GPU = torch.cuda.is_available()
-pytestmark = pytest.mark.skipif(not (HAS_GPU or AVAILABLE), reason="needs a GPU, or PyTorch with backends in Python")
+pytestmark = [
+    pytest.mark.skipif(not (HAS_GPU or AVAILABLE), reason="needs a GPU, or PyTorch with backends in Python"),
+    pytest.mark.usefixtures("few_rays"),
+]
 PLAIN = {"antialias": False, "mixed_precision": False}
 ACROSS = Plane((1.0, 0.0, 0.0), 0.0)
 
@@ -48,7 +51,8 @@ def car(device, shown=3, size=24):
 def small(device, stop=0.0):
     """Without a `stop` all samples have gradients, none of which is drawn."""
     model = HyperPlanes.from_pretrained("small").to(device)
-    model.config = replace(model.config, symmetric=False, hull_resolution=24, sampling=RayMarching(64, stop))
+    sampling = RayMarching(64, stop)
+    model.config = replace(model.config, symmetric=False, hull_resolution=24, sampling=sampling, learned_steps=1)
     return model
 
 

@@ -157,6 +157,7 @@ def test_the_update_of_another_object_is_followed_by_steps_too():
 
 def test_training_makes_a_step_that_shows_query_views_better_and_leaves_the_model_alone(monkeypatch):
     monkeypatch.setattr(training, "WARMUP", 1)
+    monkeypatch.setattr(training, "RAYS", 256)
     monkeypatch.setattr(training, "MUON_RATE", 0.05)
     adapter, data = stepping(1), Balls(views=6)
     config = TrainingConfig(steps=20, tasks=2, rays=64, views=(2, 3, 4), held_out=0)
@@ -188,6 +189,7 @@ def test_training_goes_on_from_the_step_that_the_model_has(monkeypatch):
 def test_training_begins_with_each_of_the_first_steps(monkeypatch):
     """The step that is trained follows none, one, two or three others."""
     followed, adapter = [], stepping(1)
+    monkeypatch.setattr(training, "RAYS", 16)
     monkeypatch.setattr(
         training, "step_inputs", lambda *inputs, **options: followed.append(1) or step_inputs(*inputs, **options)
     )

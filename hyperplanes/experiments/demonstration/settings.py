@@ -211,9 +211,9 @@ class DemoSettings:
             fine_tuned=(1, 2),
             tuning=(0, 2, 5),
             tuned_objects=1,
-            first=("car", "lamp"),
+            first=("car",),
             first_resolution=24,
-            first_counts=(2, 3),
+            first_counts=(3,),
             tiny=True,
         )
 
