@@ -53,13 +53,19 @@ if not STARTS_OTHERS:  # the process that starts others (`make test`) runs no te
     torch.set_num_threads(1)  # small tensors: more threads only wait for each other; tests of threads set their own
     typechecker.install("hyperplanes")
 
-
-@pytest.fixture
-def few_rays(monkeypatch):
-    """Learned steps by gradients of few rays: less exact, in a tenth of the time."""
     from hyperplanes.adaptation import learned_steps
 
-    monkeypatch.setattr(learned_steps, "RAYS", 128)
+    ALL_RAYS, learned_steps.RAYS = learned_steps.RAYS, 128  # a step takes a tenth of the time so
+
+
+@pytest.fixture(scope="module")
+def all_rays():
+    """Learned steps by gradients of as many rays as users have."""
+    from hyperplanes.adaptation import learned_steps
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learned_steps, "RAYS", ALL_RAYS)
+        yield
 
 
 @pytest.fixture

@@ -847,7 +847,6 @@ def test_a_field_of_another_kind_is_trained_by_another_protocol_and_evaluated(tm
     assert "nerf " in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("few_rays")
 def test_the_scene_that_comes_with_the_package_has_a_name(tmp_path, monkeypatch, capsys):
     task, up = read_scene(Path("example-car"), Console(silent=True))
     assert (len(task.support), len(task.query), task.name, up) == (25, 25, "example-car", "y")

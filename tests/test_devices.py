@@ -26,10 +26,7 @@ from hyperplanes.views import Task
 
 CPU = torch.device("cpu")
 HAS_GPU = torch.cuda.is_available()
-pytestmark = [
-    pytest.mark.skipif(not (HAS_GPU or AVAILABLE), reason="needs a GPU, or PyTorch with backends in Python"),
-    pytest.mark.usefixtures("few_rays"),
-]
+pytestmark = pytest.mark.skipif(not (HAS_GPU or AVAILABLE), reason="needs a GPU, or PyTorch with backends in Python")
 PLAIN = {"antialias": False, "mixed_precision": False}
 ACROSS = Plane((1.0, 0.0, 0.0), 0.0)
 

@@ -36,6 +36,8 @@ from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task
 from tests.reference_rendering import Balls, small_model
 
+pytestmark = pytest.mark.usefixtures("all_rays")
+
 SMALL = {"views": 1, "normalisation": "group", "code": 16, "depth": 2, "width": 32}
 ALL_LAYERS = ImageHyperNetworkConfig(
     **SMALL, layers=("all",), update="low_rank", weights_seen="all", activation="silu", rank=2

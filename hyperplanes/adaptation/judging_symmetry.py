@@ -108,7 +108,9 @@ class SymmetryJudge:
         found = zip(planes, errors, strict=True)
         return {plane: error for plane, error in found if error <= most and math.isfinite(error)}
 
-    def several(self, plane: Plane, error: float, given: Views, least: int = 2) -> tuple[Symmetry, float] | None:
+    def several(
+        self, plane: Plane, error: float, given: Views, least: int = 2, most: float = TOLERANCE
+    ) -> tuple[Symmetry, float] | None:
         """The most likely order of symmetries of several planes, one of which is known, and its error over its worth.
 
         Args:
@@ -116,6 +118,7 @@ class SymmetryJudge:
             error: by it alone.
             given: all views of the object, of which there are to be reflections.
             least: order.
+            most: error of such an order.
 
         Returns:
             None where it is more likely that there are no other ones.
@@ -135,7 +138,7 @@ class SymmetryJudge:
             if error > TOLERANCE:
                 continue
             possible.add(order)
-            if order >= least and error / order**WORTH < best:
+            if order >= least and error <= most and error / order**WORTH < best:
                 found, best = symmetry, error / order**WORTH
         return None if found is None else (found, best)
 

@@ -34,6 +34,7 @@ FEWEST = 2  # views that planes are judged by: a single one contradicts none of 
 FEWEST_TO_REFINE = 10  # whose hull is near enough to the object to find planes by it
 MOST = 8  # of them that are looked at
 SINGLE_VIEW_ORDER = 3  # at least: by one view, many a car is the same from the front and from the back
+SINGLE_VIEW_TOLERANCE = 1.5  # of such an order: cars have 1.7 and more, solids of revolution up to 1.3
 FOLDS, ONE_IN = 3, 6  # that are held out one after the other, each of one view in so many
 FEW = 16  # views, of which the held-out ones must gain more
 GAIN_OF_FEW, GAIN = 0.6, 0.1  # dB that reflections must bring to held-out views
@@ -95,7 +96,7 @@ def possible_symmetries(view: Views) -> list[Symmetry]:
     """
     judge = SymmetryJudge.of(view)
     errors = judge.errors([Plane.of_sphere(view.bounds, normal) for normal in VERTICAL])
-    several = [judge.several(plane, errors[plane], view, SINGLE_VIEW_ORDER) for plane in errors]
+    several = [judge.several(plane, errors[plane], view, SINGLE_VIEW_ORDER, SINGLE_VIEW_TOLERANCE) for plane in errors]
     likely = [each for each in several if each is not None]
     if likely:
         return [min(likely, key=lambda each: each[1])[0]]

@@ -17,6 +17,9 @@ from tests.adaptation.test_stacking import CONFIG, model
 from tests.reference_rendering import Balls, ball_views, ring
 
 
+pytestmark = pytest.mark.usefixtures("all_rays")
+
+
 def stepping(steps=2):
     """A model whose learned steps go against the gradient."""
     made = HyperPlanes(replace(CONFIG, stacked=False, learned_steps=steps))

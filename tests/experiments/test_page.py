@@ -184,7 +184,6 @@ def test_the_page_of_a_demonstration():
     assert find_commit() in page
 
 
-@pytest.mark.usefixtures("few_rays")
 def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small").mkdir()

@@ -100,7 +100,6 @@ def test_places_are_those_of_full_precision_under_autocast(monkeypatch, compiled
         assert all(torch.equal(*each) for each in zip(found(), expected, strict=True))
 
 
-@pytest.mark.usefixtures("few_rays")
 def test_rays_are_traced_as_without_autocast():
     views = ball_views(ring(6, (16, 16)))
     field = HyperPlanes.from_pretrained("small").adapt(views)
@@ -111,7 +110,6 @@ def test_rays_are_traced_as_without_autocast():
             assert torch.equal(each.trace(views.rays(0), differentiable=False).colour, expected)
 
 
-@pytest.mark.usefixtures("few_rays")
 def test_fields_are_adapted_and_rendered_as_without_autocast():
     """In bfloat16, directions of rays are wrong by most of a pixel."""
     generator = torch.Generator().manual_seed(0)
