@@ -35,6 +35,7 @@ FEWEST_TO_REFINE = 10  # whose hull is near enough to the object to find planes 
 MOST = 8  # of them that are looked at
 SINGLE_VIEW_ORDER = 3  # at least: by one view, many a car is the same from the front and from the back
 SINGLE_VIEW_TOLERANCE = 1.5  # of such an order: cars have 1.7 and more, solids of revolution up to 1.3
+ALIKE = 1.02  # errors in that proportion tell nothing
 FOLDS, ONE_IN = 3, 6  # that are held out one after the other, each of one view in so many
 FEW = 16  # views, of which the held-out ones must gain more
 GAIN_OF_FEW, GAIN = 0.6, 0.1  # dB that reflections must bring to held-out views
@@ -78,7 +79,7 @@ def symmetry_of(support: Views) -> Symmetry | None:
     errors = across or judge.errors([best_vertical_plane(judge, views)], TOLERANCE)
     if not errors:
         return None
-    found = min(errors, key=errors.__getitem__)
+    found = _least(errors)
     several = judge.several(found, errors[found], support)
     return Symmetry(found) if several is None else several[0]
 
@@ -111,6 +112,11 @@ class ReflectedHullBlend:
         return _blend(support, symmetry_of(support))
 
 
+def _least(errors: Mapping[Plane, float]) -> Plane:
+    """The first plane, in the order of AXES, whose error is the least or equal to that within ALIKE."""
+    return next(plane for plane, error in errors.items() if error <= ALIKE * min(errors.values()))
+
+
 def _of_many(support: Views, judge: SymmetryJudge, across: Mapping[Plane, float]) -> Symmetry | None:
     """The symmetry about the best plane by the hull of many views, if views that are held out gain by it.
 
@@ -123,7 +129,7 @@ def _of_many(support: Views, judge: SymmetryJudge, across: Mapping[Plane, float]
     if not voxels.occupied.any():
         return None
     if across:
-        more = more_symmetric_plane(voxels, min(across, key=across.__getitem__))
+        more = more_symmetric_plane(voxels, _least(across))
     else:
         more = most_symmetric_plane(voxels)
     errors = {**across, **judge.errors([more], TOLERANCE)}

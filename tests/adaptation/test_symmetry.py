@@ -188,6 +188,11 @@ def test_of_few_views_all_planes_through_one_axis_are_found(count, placed, order
     assert (found.order, found.axis) == (order, (0.0, 0.0, 0.0))
 
 
+def test_of_planes_with_nearly_the_same_error_the_first_is_taken():
+    assert symmetry._least({ACROSS.plane: 1.01, ALONG.plane: 1.0}) == ACROSS.plane
+    assert symmetry._least({ACROSS.plane: 1.05, ALONG.plane: 1.0}) == ALONG.plane
+
+
 def test_a_horizontal_plane_is_one_of_one():
     placed = [((0.2, 0.35, 0.1), 0.3, RED), ((0.2, -0.35, 0.1), 0.3, RED), ((-0.3, 0.0, -0.2), 0.2, BLUE)]
     assert symmetry_of(balls(cameras(4), placed)) == Symmetry(Plane((0.0, 1.0, 0.0)))
