@@ -16,7 +16,6 @@ from hyperplanes.training.learned_step import fit_learned_step
 from tests.adaptation.test_stacking import CONFIG, model
 from tests.reference_rendering import Balls, ball_views, ring
 
-
 pytestmark = pytest.mark.usefixtures("all_rays")
 
 
