@@ -188,6 +188,17 @@ def test_of_few_views_all_planes_through_one_axis_are_found(count, placed, order
     assert (found.order, found.axis) == (order, (0.0, 0.0, 0.0))
 
 
+def test_from_a_single_view_several_planes_need_a_smaller_error(monkeypatch):
+    """Four planes by which the error is between the two limits."""
+    errors = {1: 1.4, 2: 1.6, 3: math.inf, 4: 1.6, 6: math.inf, 8: math.inf}
+    monkeypatch.setattr(judging_symmetry.SymmetryJudge, "error", lambda judge, by: errors[by.order])
+    views = balls(cameras(2), BODY)
+    assert symmetry_of(views).order == 4
+    assert {each.order for each in possible_symmetries(views[:1])} == {1}
+    errors[4] = 1.45
+    assert {each.order for each in possible_symmetries(views[:1])} == {4}
+
+
 def test_of_planes_with_nearly_the_same_error_the_first_is_taken():
     assert symmetry._least({ACROSS.plane: 1.01, ALONG.plane: 1.0}) == ACROSS.plane
     assert symmetry._least({ACROSS.plane: 1.05, ALONG.plane: 1.0}) == ALONG.plane
