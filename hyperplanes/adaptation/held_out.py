@@ -64,7 +64,7 @@ class Trial:
 
     Attributes:
         context: of the views that are shown.
-        learned: its field, after the learned steps and before any fine-tuning.
+        learned: its field, after half of the learned steps and before any fine-tuning.
         pixels: of the others, within the hull of those that are shown.
     """
 
@@ -105,5 +105,6 @@ def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | N
     one, colours, _ = held_out.rays_at(pixels[~uneven], near_far=near_far)
     three, others, _ = held_out.rays_at(pixels[uneven], near_far=near_far, subpixels=SUBPIXELS)
     across = pixels_across(held_out.cameras, held_out.bounds)
-    learned = network.rendering_field(context, updated_weights(network, context))
+    # half of the learned steps, and views judged by the hull: the share comes out the same, in half the time
+    learned = network.field(context, updated_weights(network, context, -(-network.config.learned_steps // 2)))
     return Trial(context, learned, HeldOutPixels(one, three, torch.cat([colours, others]), across))

@@ -19,18 +19,21 @@ RAYS, PARTS = 2048, 4  # of a step, and into how many parts these are divided, e
 ONE_IN = 6  # views that are masked in a part
 
 
-def updated_weights(network: HyperPlanesNetwork, context: SupportContext) -> Parameters:
+def updated_weights(network: HyperPlanesNetwork, context: SupportContext, steps: int | None = None) -> Parameters:
     """The weights of an object as they are in use: theta + delta, changed by the learned steps.
 
     Args:
         network: the model.
         context: the object.
+        steps: as in `take_learned_steps`.
     """
-    return take_learned_steps(network, context, network.adapted_weights(context))
+    return take_learned_steps(network, context, network.adapted_weights(context), steps)
 
 
-def take_learned_steps(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> Parameters:
-    """The weights after the steps of `ModelConfig.learned_steps`.
+def take_learned_steps(
+    network: HyperPlanesNetwork, context: SupportContext, weights: Parameters, steps: int | None = None
+) -> Parameters:
+    """The weights after the learned steps.
 
     With FINE_VIEWS given views or more they are half as many: more bring nothing there (docs/image-based.md).
 
@@ -38,6 +41,7 @@ def take_learned_steps(network: HyperPlanesNetwork, context: SupportContext, wei
         network: the model.
         context: the object.
         weights: to begin with.
+        steps: of few views; those of `ModelConfig.learned_steps` where absent.
 
     Returns:
         The same weights where the model has no learned steps, and for an object without masks or of a single view.
@@ -45,7 +49,8 @@ def take_learned_steps(network: HyperPlanesNetwork, context: SupportContext, wei
     step = network.learned_step
     if step is None or context.volume is None or context.views.masks is None or len(context.given) < 2:
         return weights
-    steps, generator = network.config.learned_steps, torch.Generator().manual_seed(0)
+    steps = network.config.learned_steps if steps is None else steps
+    generator = torch.Generator().manual_seed(0)
     for _ in range(steps if len(context.given) < FINE_VIEWS else -(-steps // 2)):
         inputs = step_inputs(network, context, weights, RAYS, generator)
         with torch.no_grad():
