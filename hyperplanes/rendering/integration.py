@@ -57,8 +57,8 @@ def integrate(
     if isinstance(samples, DenseSamples):
         return _coarse_to_fine(scene, rays, sampler, samples, generator, differentiable)
     if not differentiable:
-        if isinstance(samples, OpaqueSamples) and scene.proposal is None:
-            return _at_surface(scene, rays, samples)
+        if isinstance(samples, OpaqueSamples) and isinstance(scene.field, SplitField):
+            return _at_surface(scene.field, rays, samples, scene.background)
         return _front_to_back(scene, rays, samples, sampler.stop)
     if generator is None or sampler.stop == 0 or not _has_importance(scene, samples):
         return _all_at_once(scene, rays, samples)
@@ -116,17 +116,13 @@ def _all_at_once(scene: Scene, rays: Rays, samples: PackedSamples) -> Rendered:
     return replace(fine, samples=fine.samples + coarse.samples, coarse=coarse)
 
 
-def _at_surface(scene: Scene, rays: Rays, samples: OpaqueSamples) -> Rendered:
-    """The pixels of rays that end at their samples."""
+def _at_surface(field: SplitField, rays: Rays, samples: OpaqueSamples, background: float) -> Rendered:
+    """The pixels of rays that end at their samples, whose densities are not evaluated."""
     points, directions = _packed_points(rays, samples)
-    if isinstance(scene.field, SplitField):
-        batches = zip(*(each.split(points_per_batch(points.device)) for each in (points, directions)), strict=True)
-        found = [scene.field.colour_of(scene.field.hidden(place), along) for place, along in batches]
-        colour = torch.cat([rays.origins.new_zeros(0, 3), *found])
-    else:
-        colour, _ = evaluate(scene.field, points, directions, differentiable=False)
-    whole = torch.ones_like(samples.distances)
-    return composite_packed(colour, whole, samples.distances, samples.ray, len(rays), scene.background)
+    batches = zip(*(each.split(points_per_batch(points.device)) for each in (points, directions)), strict=True)
+    found = [field.colour_of(field.hidden(place), along) for place, along in batches]
+    colour, whole = torch.cat([rays.origins.new_zeros(0, 3), *found]), torch.ones_like(samples.distances)
+    return composite_packed(colour, whole, samples.distances, samples.ray, len(rays), background)
 
 
 def _has_importance(scene: Scene, samples: PackedSamples) -> bool:
