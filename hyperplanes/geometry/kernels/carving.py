@@ -13,7 +13,7 @@ import numpy as np
 from hyperplanes.geometry.kernels.blocks import inlined
 from hyperplanes.geometry.kernels.llvm import load, read, store
 
-__all__ = ["carve"]
+__all__ = ["LANES", "carve", "fill_lanes"]
 
 LANES = 16
 
@@ -65,6 +65,18 @@ def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius
     return left_over
 
 
+@inlined
+@no_type_check
+def fill_lanes(alive, occupied, i, j, begin, count, value):
+    """Writes a value into the lanes of occupied voxels, `count` at most, and 0 into the others; how many are occupied."""
+    given = 0
+    for k in range(LANES):
+        left = occupied[i, j, begin + k] if k < count else 0
+        alive[k] = value if left else 0
+        given += left
+    return given
+
+
 @no_type_check
 def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, votes, occupied, start, stop):
     """Clears the voxels in layers start..stop of `occupied` that `occupancy.carve` describes as ruled out.
@@ -82,12 +94,7 @@ def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, votes, o
             for begin in range(0, occupied.shape[2], LANES):
                 count = min(LANES, occupied.shape[2] - begin)
                 bottom = corner[2] + corner.dtype.type(begin) * voxel
-                given = 0
-                for k in range(LANES):
-                    left = occupied[i, j, begin + k] if k < count else 0
-                    alive[k] = votes if left else 0
-                    given += left
-                if given == 0:
+                if fill_lanes(alive, occupied, i, j, begin, count, votes) == 0:
                     continue
                 for turn in range(planes):  # the view that ruled out the last voxels often rules out their neighbours
                     view = last + turn if last + turn < planes else last + turn - planes

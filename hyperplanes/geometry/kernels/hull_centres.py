@@ -7,12 +7,11 @@ from typing import no_type_check
 import numpy as np
 
 from hyperplanes.geometry.kernels.blocks import inlined
+from hyperplanes.geometry.kernels.carving import LANES, fill_lanes
 from hyperplanes.geometry.kernels.llvm import load, read, store
 from hyperplanes.geometry.lookup_torch import BORDER
 
 __all__ = ["centres"]
-
-LANES = 16
 
 
 @inlined
@@ -73,12 +72,7 @@ def centres(cameras, maps, shape, corner, voxel, limits, occupied, start, stop):
             for begin in range(0, occupied.shape[2], LANES):
                 count = min(LANES, occupied.shape[2] - begin)
                 bottom = corner[2] + corner.dtype.type(begin) * voxel
-                given = 0
-                for k in range(LANES):
-                    left = occupied[i, j, begin + k] if k < count else 0
-                    inside[k] = left
-                    given += left
-                if given == 0:
+                if fill_lanes(inside, occupied, i, j, begin, count, 1) == 0:
                     continue
                 for turn in range(shape[0]):  # the view that cut the last voxels away often does so with the next ones
                     view = last + turn if last + turn < shape[0] else last + turn - shape[0]
