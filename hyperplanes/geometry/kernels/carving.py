@@ -68,7 +68,7 @@ def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius
 @inlined
 @no_type_check
 def fill_lanes(alive, occupied, i, j, begin, count, value):
-    """Writes a value into the lanes of occupied voxels, `count` at most, and 0 into the others; how many are occupied."""
+    """Writes a value into the lanes of the first `count` voxels that are occupied, 0 into others; how many are so."""
     given = 0
     for k in range(LANES):
         left = occupied[i, j, begin + k] if k < count else 0
