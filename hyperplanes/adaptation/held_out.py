@@ -105,6 +105,6 @@ def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | N
     one, colours, _ = held_out.rays_at(pixels[~uneven], near_far=near_far)
     three, others, _ = held_out.rays_at(pixels[uneven], near_far=near_far, subpixels=SUBPIXELS)
     across = pixels_across(held_out.cameras, held_out.bounds)
-    # half of the learned steps, and views judged by the hull: the share comes out the same, in half the time
+    # half of the learned steps, and views judged by the hull: pictures lose 0.01 dB, and it takes half the time
     learned = network.field(context, updated_weights(network, context, -(-network.config.learned_steps // 2)))
     return Trial(context, learned, HeldOutPixels(one, three, torch.cat([colours, others]), across))
