@@ -57,7 +57,7 @@ MORE = {"baked": ["--objects", "2", "--query", "4", "--counts", "25", "3"]}
 _METHODS = ["--methods", "nearest_view", "hull_blend", "hull_blend_reflected", "unreflected"]
 _TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", *_METHODS]
 _TUNED = ["--counts", "3", "25", "--query", "2", "--steps", "100", "--methods", "hull_blend"]
-_RESIDUALS = ["--query", "2", "--methods", "hull_blend", "residuals"]
+_RESIDUALS = ["--query", "2", "--methods", "hull_blend", "uncorrected"]
 OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_procedural": (["procedural"], _TEN),
     "views_cc0": (["cc0"], _TEN),
@@ -73,8 +73,8 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
         ["--objects", "5", "--query", "2", "--counts", "2", "3", "5", "12", "--rotated", "33"]
         + ["--methods", "hull_blend", "hull_blend_reflected", "unreflected", "unrotated"],
     ),
-    "views_residuals": (["procedural", "cc0", "random"], ["--objects", "5", "--counts", "5", "25", *_RESIDUALS]),
-    "views_residuals_posed": (["posed"], ["--counts", "5", "25", "50", *_RESIDUALS]),
+    "views_residuals": (["procedural", "cc0", "random"], ["--objects", "10", "--counts", "25", *_RESIDUALS]),
+    "views_residuals_posed": (["posed"], ["--counts", "25", "50", *_RESIDUALS]),
     "views_tuned": (["procedural", "cc0", "random"], ["--objects", "10", *_TUNED]),
     "views_tuned_posed": (["posed"], ["--seeds", "5", *_TUNED]),
 }

@@ -64,7 +64,7 @@ def main(arguments: list[str]) -> int:
 
 def measure(model: HyperPlanes, task: Task, side: int | None, fit: int) -> dict[str, float]:
     """One object: PSNR by the field, the voxels and the fitted voxels, and seconds; times of a view are medians."""
-    adapted, cameras = model.adapt(task.support), task.query.cameras
+    adapted, cameras = model.adapt(task.support).without_residuals(), task.query.cameras
     adapted.render(task.query[:1].cameras)  # compiles, and refines the occupancy
     field_seconds, by_field = timed(lambda: adapted.render(cameras))
     bake_seconds, baked = timed(lambda: bake(adapted, side=side or default_side(task.support.size)))

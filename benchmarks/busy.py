@@ -130,7 +130,7 @@ def _work(name: str, quick: bool) -> Callable[[], object]:
         return lambda: model.fine_tune(task.support, 1 if quick else 5)
     if name == "training":
         return _training(model, task)
-    field, cameras = model.adapt(task.support), task.query[: 1 if quick else 4].cameras
+    field, cameras = model.adapt(task.support).without_residuals(), task.query[: 1 if quick else 4].cameras
     return lambda: field.render(cameras)
 
 

@@ -84,7 +84,7 @@ def views(checkpoint: str, data: Tasks, device: torch.device, sizes: tuple[int, 
     rows: list[Row] = []
     for size in sizes:
         task = _task(data, size, device)
-        adapted = model.adapt(task.support)
+        adapted = model.adapt(task.support).without_residuals()
         drawn = {"default": _drawing(adapted, antialias=True), "one ray a pixel": _drawing(adapted)}
         if not isinstance(adapted, StackedField):  # the hull beside such a one has no coarse pass
             drawn["paper's protocol"] = _drawing(adapted, sampling=PAPER_SAMPLES)

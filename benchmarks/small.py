@@ -67,6 +67,7 @@ def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
     """One object: ours and the reference in turn, view by view."""
     model.adapt(task.support)  # compiles, and fills caches
     adapt, adapted = timed(lambda: model.adapt(task.support))
+    adapted = adapted.without_residuals()
     with _plainly():
         adapted(*2 * (adapted.occupancy.centres()[:1],))  # compiles
         voxels = refine_voxels(adapted.occupancy, adapted.density)

@@ -55,7 +55,7 @@ def main(arguments: list[str]) -> int:
 def measure(model: HyperPlanes, task: Task, voxel_steps: int = STEPS, splat_steps: int = 160) -> Row:
     """One object as a field, as voxels and as splats."""
     shown, asked = task.support, task.query[:COMPARED]
-    field = model.adapt(shown)
+    field = model.adapt(shown).without_residuals()
     baked = bake(field, side=default_side(shown.size))
     fit_splats(splats_of(baked), shown, steps=1)  # compiles
     voxel_seconds, baked = timed(lambda: fit_voxels(baked, shown, steps=voxel_steps))

@@ -99,16 +99,16 @@ def views_summary(*results: Result) -> str:
 
 
 def views_residuals(*results: Result) -> str:
-    """One forward pass of `small`, and its pictures corrected by the residuals of the support views."""
+    """One forward pass of `small` without residual correction, and with it."""
     found, counts = _of_views(results)
     lines = []
     for name, rows in found.items():
-        for count in (each for each in counts if ("residuals", each) in rows):
-            scores = [rows[method, count]["psnr"] for method in ("hull_blend", "one_step", "residuals")]
-            over = _above(rows["residuals", count], "over_one_step")
-            objects = rows["residuals", count]["objects"]
+        for count in (each for each in counts if ("uncorrected", each) in rows):
+            scores = [rows[method, count]["psnr"] for method in ("hull_blend", "uncorrected", "one_step")]
+            over = _above(rows["one_step", count], "over_uncorrected")
+            objects = rows["one_step", count]["objects"]
             lines.append([f"{name} ({objects})", str(count), *(f"{score:.2f}" for score in scores), over])
-    headings = ["views", "`hull_blend`", "one forward pass", "with residuals", "gain"]
+    headings = ["views", "`hull_blend`", "without", "with residual correction", "gain"]
     return markdown_table(["", *headings], lines)
 
 

@@ -42,7 +42,7 @@ from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Rendera
 from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
-from hyperplanes.adaptation.residuals import WithResiduals
+from hyperplanes.adaptation.residuals import corrected_field
 from hyperplanes.adaptation.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.swapped import Swapped
@@ -176,7 +176,7 @@ def _measured(
         row |= {"seeds": len(tried)} if len(tried) > 1 else {}
         row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
         row["worst"] = min(each.psnr for each in score.objects)
-        uncorrected = "one_step" if method == "residuals" else method.removesuffix("_residuals")
+        uncorrected = "uncorrected" if method == "one_step" else f"{method}_uncorrected"
         for reference in ("hull_blend", f"scratch_{method.removesuffix('_steps')}", uncorrected):
             row |= _above(score, scores[reference]) if reference in scores else {}
         scores[method] = score
@@ -243,9 +243,9 @@ def made_by(suite: str, path: Path) -> str:
 
 def _after_its_references(method: str) -> int:
     """Sorts methods such that those come first that others are compared with."""
-    if method.endswith("residuals"):
-        return 3
-    return 0 if method == "hull_blend" else 1 if method.startswith("scratch_") else 2
+    if method == "hull_blend":
+        return 0
+    return 1 if method.startswith("scratch_") or method.endswith("uncorrected") else 2
 
 
 def _above(score: Score, reference: Score) -> Row:
@@ -296,8 +296,8 @@ def adapters(
     for each in steps:
         settings = FineTuning(seed=seed)
         found[f"{each}_steps"] = tuned = FineTuned(model, each, settings)
-        if "residuals" in wanted:
-            found[f"{each}_steps_residuals"] = WithResiduals(tuned)
+        if "uncorrected" in wanted:
+            found[f"{each}_steps_uncorrected"] = FineTuned(_changed(model, residuals=False), each, settings)
         if "ungated" in wanted:
             found[f"{each}_steps_ungated"] = _Ungated(tuned)
         found[f"scratch_{each}"] = FromScratch(model, each, settings)
@@ -330,11 +330,11 @@ class _FieldAlone:
         return placed.in_scene(model.rendering_field(prepared, parameters))
 
 
-def _without_learned_steps(model: HyperPlanes) -> HyperPlanes:
-    """The model whose fields are those of the hypernetwork's update alone."""
-    alone = copy.copy(model)  # with the same weights
-    alone.config = replace(model.config, learned_steps=0)
-    return alone
+def _changed(model: HyperPlanes, **settings: Any) -> HyperPlanes:
+    """The model with the same weights and other settings."""
+    changed = copy.copy(model)
+    changed.config = replace(model.config, **settings)
+    return changed
 
 
 @dataclass(frozen=True)
@@ -345,10 +345,11 @@ class _Ungated:
 
     def adapt(self, support: Views) -> AdaptedField:
         """The model's own field without its gating network."""
-        found = self.model.adapt(support)
+        found = self.model.adapt(support).without_residuals()
         if isinstance(found, RotatedField):
-            return found.rotation.field(_ungated(found.unrotated))
-        return _ungated(found)
+            found = found.rotation.field(_ungated(found.unrotated))
+        model = self.model.model if isinstance(self.model, FineTuned) else self.model
+        return corrected_field(model, _ungated(found), support)
 
 
 def _ungated(field: AdaptedField) -> AdaptedField:
@@ -379,7 +380,7 @@ class _Unrotated:
 
 @dataclass(frozen=True)
 class _Rendered:
-    """A model whose pictures are rendered by other options.
+    """A model whose pictures are rendered by other options, without residual correction.
 
     Attributes:
         model: the model.
@@ -400,7 +401,7 @@ class _RenderedField:
     options: Mapping[str, Any]
 
     def render(self, cameras: PinholeCamera) -> Pictures:
-        return self.field.render(cameras, **self.options)
+        return self.field.without_residuals().render(cameras, **self.options)
 
 
 def _swapped(model: HyperPlanes, shown: Tasks, names: list[str]) -> Adapter:
@@ -417,8 +418,8 @@ METHODS = {
     "ungated": lambda model, *_: _Ungated(model),
     "unreflected": lambda model, *_: _Unreflected(model),
     "unrotated": lambda model, *_: _Unrotated(model),
-    "no_learned_steps": lambda model, *_: _without_learned_steps(model),
+    "no_learned_steps": lambda model, *_: _changed(model, learned_steps=0),
     "one_ray": lambda model, *_: _Rendered(model, {"antialias": False}),
-    "residuals": lambda model, *_: WithResiduals(model),
+    "uncorrected": lambda model, *_: _changed(model, residuals=False),
     "single_precision": lambda model, *_: _Rendered(model, {"mixed_precision": False}),
 }

@@ -28,7 +28,7 @@ from rendered_here import rendered_here
 from small_demo import demo_folder, demo_preset, first_object
 
 from data_gen.rendering.renderers import RendererError
-from hyperplanes.adaptation import HullBlend, HyperPlanes, WithResiduals
+from hyperplanes.adaptation import HullBlend, HyperPlanes, ResidualField
 from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
 from hyperplanes.cli import main
 from hyperplanes.commands import adapt, find_verbs, render
@@ -517,10 +517,10 @@ def test_render_writes_the_query_views_under_their_names(tmp_path):
 
 def test_render_adds_residuals_when_asked_to(tmp_path, capsys):
     demo, scene = demo_folder(), first_object(demo_folder())
-    command = ["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path), "--residuals"]
+    command = ["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path), "--residuals", "on"]
     assert main(command) == 0
     task, model = read_task(scene), HyperPlanes.from_pretrained(find_checkpoint(demo))
-    corrected = WithResiduals(model).adapt(task.support).render(task.query.cameras).images
+    corrected = ResidualField(model.adapt(task.support), task.support).render(task.query.cameras).images
     assert (corrected - model.adapt(task.support).render(task.query.cameras).images).abs().max() > 0.02
     for name, expected in zip(task.query.names, to_pixels(corrected).astype(int), strict=True):
         assert abs(pixels(tmp_path / Path(name).name) - expected).max() <= 1

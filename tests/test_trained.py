@@ -129,9 +129,10 @@ def coarse(name, *, symmetric=False, learned_steps=0):
 
     Where a test is not about reflections it looks for no symmetry, nor for a rotation: both take longer than to adapt.
     Where it is not about learned steps it takes none: what the forward pass alone brings, in two thirds of the time.
+    Pictures are not corrected by residuals.
     """
     model = HyperPlanes.from_pretrained(name)
-    changes = {"symmetric": symmetric, "azimuth": 0.0, "learned_steps": learned_steps}
+    changes = {"symmetric": symmetric, "azimuth": 0.0, "learned_steps": learned_steps, "residuals": False}
     model.config = replace(model.config, hull_resolution=64, **changes)
     return model
 

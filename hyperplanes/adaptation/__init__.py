@@ -7,7 +7,7 @@ from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromS
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.nearest_view import NearestView
-from hyperplanes.adaptation.residuals import ResidualField, WithResiduals
+from hyperplanes.adaptation.residuals import CorrectedField, ResidualField
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.initialisation import InitialisationConfig
@@ -15,6 +15,7 @@ from hyperplanes.configuration.initialisation import InitialisationConfig
 __all__ = [
     "AdaptedField",
     "Adapter",
+    "CorrectedField",
     "Diagnostics",
     "FieldFromScratch",
     "FineTuned",
@@ -30,7 +31,6 @@ __all__ = [
     "ResidualField",
     "SupportContext",
     "Swapped",
-    "WithResiduals",
     "diagnose",
     "swap_gap",
 ]

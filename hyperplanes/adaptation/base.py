@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -92,13 +92,17 @@ class AdaptedField:
         cameras = camera.pinhole(camera.symmetric_intrinsics(96, 96, 0.8), poses, 96, 96)
         return show_views(repr(self), self.render(cameras).images, cameras, bounds)
 
-    def with_sampling(self, sampling: Sampler) -> Self:
+    def with_sampling(self, sampling: Sampler) -> AdaptedField:
         """The same field, rendered by another sampler.
 
         Args:
             sampling: the sampler.
         """
         return replace(self, sampling=sampling)
+
+    def without_residuals(self) -> AdaptedField:
+        """The same field, whose pictures are not corrected (`adaptation.residuals`)."""
+        return self
 
     @property
     def dtype(self) -> torch.dtype:

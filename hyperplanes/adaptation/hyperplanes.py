@@ -17,6 +17,7 @@ from hyperplanes.adaptation.fine_tuning import fine_tune, one_step
 from hyperplanes.adaptation.hub import upload_checkpoint
 from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
+from hyperplanes.adaptation.residuals import corrected_field
 from hyperplanes.adaptation.rotation import RotatedField
 from hyperplanes.adaptation.stacking import learned_part, stacked_field
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
@@ -59,9 +60,11 @@ class HyperPlanes(HyperPlanesNetwork):
         A network then takes `config.learned_steps` steps of gradient descent (`adaptation.learned_steps`). Where
         `config.symmetric` says so, reflections of the views of an object that looks symmetric count as views, too
         (`adaptation.symmetry`), and it is adapted to in its canonical frame (`adaptation.canonical_frame`). Where
-        `config.stacked` says so, its pictures are means with those of the visual hull (`adaptation.stacking`).
+        `config.stacked` says so, its pictures are means with those of the visual hull (`adaptation.stacking`). Where
+        `config.residuals` says so, pictures are corrected by what the field lacks in its views
+        (`adaptation.residuals`).
         """
-        return one_step(self, support)
+        return corrected_field(self, one_step(self, support), support)
 
     @checked
     @without_autocast
@@ -82,7 +85,7 @@ class HyperPlanes(HyperPlanesNetwork):
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:
         """As `adapt`, of an object that is prepared, with reflections of its views or without."""
-        return stacked_field(self, context, updated_weights(self, context))
+        return corrected_field(self, stacked_field(self, context, updated_weights(self, context)), context.given)
 
     @checked
     @without_autocast
@@ -101,7 +104,7 @@ class HyperPlanes(HyperPlanesNetwork):
         themselves are optimised, or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes,
         section 3, fine-tuning). No step is the field of `adapt`. From 20 views on the weights' grid of features
         gets more cells (`settings.cells`). Where the model has a gating network, pictures from ten views on are
-        means with those of the visual hull (`stacking.tuned_field`).
+        means with those of the visual hull (`stacking.tuned_field`). They are corrected as those of `adapt`.
 
         Args:
             support: the views of the object.
@@ -122,7 +125,8 @@ class HyperPlanes(HyperPlanesNetwork):
         """
         if torch.is_inference_mode_enabled():
             raise RuntimeError("fine_tune: expected gradients, got torch.inference_mode; call it outside of that")
-        return fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
+        tuned = fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
+        return corrected_field(self, tuned, support)
 
     def with_weights_of(self, adapted: AdaptedField) -> HyperPlanes:
         """The weights of one object as a model without a hypernetwork: its theta is theta + delta (HyperPlanes, Eq. 6).
@@ -136,6 +140,7 @@ class HyperPlanes(HyperPlanesNetwork):
         Raises:
             ValueError: a field that is no network of this model.
         """
+        adapted = adapted.without_residuals()
         learned = learned_part(adapted)
         beside = {"hull_share": learned.share, "gated": learned.gate is not None}
         azimuth = -adapted.rotation.angle if isinstance(adapted, RotatedField) else 0.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from threading import RLock
 
 import torch
@@ -18,24 +18,30 @@ from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.adaptation.base import Adapter, Pictures, Renderable
+from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable
+from hyperplanes.adaptation.network import HyperPlanesNetwork
+from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.geometry.rays import Rays, cast, pixel_grid
+from hyperplanes.rendering.compositing import Rendered
+from hyperplanes.rendering.refinement import RefinedOccupancy
+from hyperplanes.rendering.renderer import Sampler
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.memory import require_memory
 from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views
 
-__all__ = ["ResidualField", "WithResiduals"]
+__all__ = ["CorrectedField", "ResidualField", "corrected_field"]
 
 SHARPNESS = 10.0  # of weights over 1 - the cosine of the angle between rays: a third at 27 degrees
 WIDEST = 0.5  # of that, from which on the weight is 0: 60 degrees
 TOLERANCE = 0.25  # of the radius, by which a support view may see a surface in front or behind, at a weight of 1 / e
-DOUBT = 0.03  # weight of no residual at all
+DOUBT = 0.3  # weight of no residual at all
 FAINT, SOLID = 0.01, 1 / 3  # opacity of a pixel from which on it is corrected, and from which on wholly
 PAIRS = 1 << 18  # of a pixel and a support view, at once
 VIEWS = 8  # support views that are rendered together
+MOST_PIXELS = 1 << 21  # of support views, such as 52 of 200x200: larger ones take longer to render than to adapt to
 
 _rendering = RLock()  # support views: two threads that need the same ones render them once
 
@@ -76,7 +82,16 @@ class ResidualField:
         Returns:
             One picture a camera, with colours in [0, 1].
         """
-        pictures = self.uncorrected.render(cameras)
+        return self.correct(self.uncorrected.render(cameras), cameras)
+
+    @torch.no_grad()
+    def correct(self, pictures: Pictures, cameras: PinholeCamera) -> Pictures:
+        """The pictures that the field has of cameras, with what it lacks in the support views.
+
+        Args:
+            pictures: one a camera.
+            cameras: as in `render`.
+        """
         images, cameras = pictures.images.clone(), camera.to(cameras, pictures.images.device)
         pixels = pixel_grid(*camera.image_size(cameras), images.device)
         for view in range(len(images)):
@@ -145,20 +160,74 @@ class ResidualField:
                 self._known.update(some)
 
 
-@dataclass(frozen=True)
-class WithResiduals:
-    """A method whose fields are corrected by their support views.
+@dataclass(frozen=True, repr=False)
+class CorrectedField(AdaptedField):
+    """A field whose pictures are corrected by residuals of its support views.
+
+    Densities, colours, rays and meshes are those of the field, and so are pictures by another sampler than its own or
+    with so many rays a pixel as the caller says: residuals are of the pictures that it has by default.
 
     Attributes:
-        method: what makes the fields.
+        uncorrected: the field.
+        residuals: what corrects its pictures.
     """
 
-    method: Adapter
+    uncorrected: AdaptedField = field(kw_only=True)
+    residuals: ResidualField = field(kw_only=True)
 
-    def adapt(self, support: Views) -> ResidualField:
-        """The field of one object, corrected.
+    def __repr__(self) -> str:
+        return f"CorrectedField({self.uncorrected!r}, {len(self.residuals.views)} views)"
 
-        Args:
-            support: its views.
-        """
-        return ResidualField(self.method.adapt(support), support)
+    def without_residuals(self) -> AdaptedField:
+        """As `AdaptedField.without_residuals`."""
+        return self.uncorrected
+
+    def with_sampling(self, sampling: Sampler) -> AdaptedField:
+        """As `AdaptedField.with_sampling`, without correction."""
+        return self.uncorrected.with_sampling(sampling)
+
+    @property
+    def refined_occupancy(self) -> RefinedOccupancy:
+        """As `AdaptedField.refined_occupancy`."""
+        return self.uncorrected.refined_occupancy
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """As `AdaptedField.density`."""
+        return self.uncorrected.density(points)
+
+    def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
+        """As `AdaptedField.trace`, without correction."""
+        return self.uncorrected.trace(rays, generator, differentiable=differentiable)
+
+    def render(
+        self,
+        cameras: PinholeCamera,
+        sampling: Sampler | None = None,
+        antialias: bool | None = None,
+        *,
+        mixed_precision: bool = True,
+    ) -> Pictures:
+        """As `AdaptedField.render`, corrected where neither a sampler nor rays a pixel are given."""
+        pictures = self.uncorrected.render(cameras, sampling, antialias, mixed_precision=mixed_precision)
+        if sampling is not None or antialias is not None:
+            return pictures
+        return self.residuals.correct(pictures, cameras)
+
+
+def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support: Views) -> AdaptedField:
+    """A field whose pictures are corrected where the model is configured so, and where that is worth its time.
+
+    Args:
+        network: the model.
+        adapted: its field.
+        support: the views of the object.
+
+    Returns:
+        A `CorrectedField` of MANY_VIEWS with masks or more, which have MOST_PIXELS at most; else the field.
+    """
+    height, width = support.size
+    few = len(support) < MANY_VIEWS or support.masks is None
+    if few or not network.config.residuals or len(support) * height * width > MOST_PIXELS:
+        return adapted
+    own = {each.name: getattr(adapted, each.name) for each in fields(AdaptedField)}
+    return CorrectedField(**own, uncorrected=adapted, residuals=ResidualField(adapted, network.to_own(support)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import Self, TypeVar
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -70,7 +70,7 @@ class StackedField(AdaptedField):
     def __repr__(self) -> str:
         return f"StackedField({super().__repr__()}, {self.share:.0%} of {self.other!r})"
 
-    def with_sampling(self, sampling: Sampler) -> Self:
+    def with_sampling(self, sampling: Sampler) -> AdaptedField:
         """As `AdaptedField.with_sampling`, of the learned field; the visual hull keeps its own."""
         if self.overruled:
             return replace(self, other=self.other.with_sampling(sampling))

@@ -12,6 +12,7 @@ from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.learned_steps import take_learned_steps
 from hyperplanes.adaptation.network import in_use
+from hyperplanes.adaptation.residuals import corrected_field
 from hyperplanes.adaptation.stacking import stacked_field
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
@@ -51,7 +52,8 @@ class Swapped:
         own = _digest(self.model, support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]
         weights = take_learned_steps(self.model, prepared, self.model.theta + self._updates[other])
-        return placed.in_scene(stacked_field(self.model, prepared, weights))
+        made = placed.in_scene(stacked_field(self.model, prepared, weights))
+        return corrected_field(self.model, made, support)
 
 
 def _digest(model: HyperPlanes, support: Views) -> str:

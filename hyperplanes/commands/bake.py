@@ -94,6 +94,7 @@ def run(arguments: Arguments) -> int:
     shown, query = task.support.to(device), task.query
     field, _ = adapt_to(model, shown, task.name, console, steps=arguments.steps)
     assert isinstance(field, AdaptedField)
+    field = field.without_residuals()
     side = arguments.voxels or default_side(shown.size)
     baked = bake_field(field, shown, side, fit=arguments.fit, console=console)
     baked.save(arguments.out)

@@ -155,7 +155,8 @@ def run(arguments: Arguments) -> int:
         from hyperplanes.export.points import point_cloud, save_points
 
         bounds = (field if isinstance(field, AdaptedField) else field.adapted).occupancy.bounds
-        pictures = render_views(field, shown.cameras, console)
+        plain = field.without_residuals() if isinstance(field, AdaptedField) else field
+        pictures = render_views(plain, shown.cameras, console)
         with rename_errors("count", "--points"):
             cloud = point_cloud(pictures, shown.cameras, bounds, arguments.points)
         path = save_points(cloud, out / "points.ply")

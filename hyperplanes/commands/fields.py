@@ -116,6 +116,7 @@ def adapt_to(
         ValueError: fine-tuning steps of a baked scene.
     """
     from hyperplanes.adaptation.kept import keep_field, kept_folder, recall_field
+    from hyperplanes.adaptation.residuals import CorrectedField
     from hyperplanes.adaptation.rotation import RotatedField
     from hyperplanes.adaptation.stacking import StackedField
     from hyperplanes.configuration.fine_tuning import FineTuning
@@ -157,10 +158,12 @@ def adapt_to(
     if field.symmetry is not None:
         planes = field.symmetry.order
         how += ", together with their reflections" + (f" about {planes} planes" if planes > 1 else "")
-    rendered = field.unrotated if isinstance(field, RotatedField) else field
-    if rendered is not field:
+    rendered = field.without_residuals()
+    if isinstance(rendered, RotatedField):
         how += ", rotated into its canonical frame"
+        rendered = rendered.unrotated
     how += ", averaged with hull_blend" if isinstance(rendered, StackedField) else ""
+    how += ", corrected by residuals" if isinstance(field, CorrectedField) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")
     return field, warned

@@ -69,7 +69,7 @@ class Arguments(ObjectArguments):
             shown views, which takes half a minute once and milliseconds a picture. auto takes voxels for an orbit or
             a path of so many pictures that they are drawn sooner so, where 16 views or more are shown.
         residuals: Add to the pictures what the field lacks where the shown views see the same places. All shown views
-            are rendered for that first. From 25 views it brings up to 1.2 dB.
+            are rendered for that first. auto: where the model does so, `small` from 10 views on, unless they are large.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
             marching through what is not empty.
     """
@@ -82,7 +82,7 @@ class Arguments(ObjectArguments):
     size: OptionalInt = None
     turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"
     representation: Literal["auto", "field", "voxels"] = "auto"
-    residuals: bool = False
+    residuals: Literal["auto", "on", "off"] = "auto"
     protocol: Protocol = "default"
 
 
@@ -105,7 +105,8 @@ class Asked:
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
-    from hyperplanes.adaptation.residuals import ResidualField
+    from hyperplanes.adaptation.base import AdaptedField
+    from hyperplanes.adaptation.residuals import CorrectedField, ResidualField
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
@@ -134,12 +135,16 @@ def run(arguments: Arguments) -> int:
     asked = _asked(arguments, shown, known, up, console)
     settings = FineTuning(trainable=arguments.fine_tune)
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
+    if isinstance(field, AdaptedField) and (arguments.residuals == "off" or arguments.protocol != "default"):
+        field = field.without_residuals()
     make = partial(bake_field, fit=VOXEL_STEPS, console=console)
     field = choose_representation(field, shown, asked.cameras, _representation(arguments, asked), make=make)
-    if arguments.residuals:
+    if arguments.residuals == "on" and not isinstance(field, CorrectedField):
         field = ResidualField(field, shown)
+    residuals = field.residuals if isinstance(field, CorrectedField) else field
+    if isinstance(residuals, ResidualField):
         with console.bar("residuals") as bar:
-            field.prepare(lambda done: bar.show(done, len(shown), "shown views"))
+            residuals.prepare(lambda done: bar.show(done, len(shown), "shown views"))
     started = time.perf_counter()
     pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / asked.cameras.batch_size
@@ -159,7 +164,7 @@ def run(arguments: Arguments) -> int:
     if scores is None and not isinstance(source, BakedScene) and (arguments.steps == 0 or warned):
         scores = held_out_psnr(source, shown)
         if scores is not None:
-            without = " and residuals" if arguments.residuals else ""
+            without = " and residuals" if isinstance(residuals, ResidualField) else ""
             console.say(
                 f"without fine-tuning{without}, on support views left out for this: {scores[0]:.2f} dB PSNR, "
                 f"copying the nearest view {scores[1]:.2f} dB"
@@ -196,9 +201,9 @@ def _check(arguments: Arguments) -> None:
         raise ValueError(
             "--protocol: expected none with --representation voxels, which are not sampled so; leave one out"
         )
-    if arguments.residuals and arguments.protocol != "default":
+    if arguments.residuals == "on" and arguments.protocol != "default":
         raise ValueError(
-            f"--protocol: expected none with --residuals, which are of the field as it was trained, got "
+            f"--protocol: expected none with --residuals on, which are of the field as it was trained, got "
             f"{arguments.protocol}; leave one out"
         )
     if arguments.camera_path is None:

@@ -188,7 +188,9 @@ def _adapt(
         if done % EVERY == 0 or done == steps:
             with torch.no_grad():
                 weights = Parameters((name, value.clone()) for name, value in variables.weights().items())
-            field = placed.in_scene(tuned_field(model, context, weights) if steps else model.adapt_to(context))
+            field = placed.in_scene(
+                tuned_field(model, context, weights) if steps else model.adapt_to(context).without_residuals()
+            )
             viewer.show(field, f"{len(shown)} support views, {done} of {steps} fine-tuning steps")
         _check(wanted)
     if arguments.fit and field is not None:

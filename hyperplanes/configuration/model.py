@@ -58,6 +58,8 @@ class ModelConfig:
         learned_steps: steps of gradient descent that a network takes after the forward pass
             (`adaptation.learned_steps`), half as many from twenty views on; `training.learned_step` trains it after the
             model.
+        residuals: pictures from ten views or more, unless these are large, are corrected by what the field lacks in
+            them (`adaptation.residuals`).
         symmetric: views of an object that looks symmetric are shown to the model together with their reflections
             (`adaptation.symmetry`). Training does without.
         symmetry: that of the object, where it is known: what was found for one.
@@ -79,6 +81,7 @@ class ModelConfig:
     hull_share: float = 0.0
     gated: bool = False
     learned_steps: Annotated[int, range(33)] = 0
+    residuals: bool = False
     symmetric: bool = False
     symmetry: Symmetry | None = None
     azimuth: float | None = None

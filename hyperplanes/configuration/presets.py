@@ -108,7 +108,7 @@ class Preset:
     def for_known_places(self) -> Preset:
         """Without what only a field of any number of views can do: be trained by some of them, and be shown more."""
         alone = {"stacked": False, "gated": False, "learned_steps": 0, "hull_share": 0.0, "symmetric": False}
-        model = replace(self.model, **alone, symmetry=None, azimuth=None)
+        model = replace(self.model, **alone, residuals=False, symmetry=None, azimuth=None)
         return replace(self, model=model, training=replace(_of_all_views(self.training), volume_loss=0.0))
 
     def without_hypernetwork(self) -> Preset:
@@ -210,6 +210,7 @@ PRESETS: dict[str, Preset] = {
             sampling=RayMarching(steps=64),
             hull_resolution=96,
             stacked=True,
+            residuals=True,
             symmetric=True,
         ),
         replace(

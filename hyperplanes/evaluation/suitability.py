@@ -77,6 +77,8 @@ def worse_than_copying(shown: Views, rendered: float, copied: float, steps: obje
 def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | None:
     """PSNR of a field on support views that it was not shown, and of the nearest view copied, in one forward pass.
 
+    Pictures are those without residual correction, for which all shown views would be rendered.
+
     Up to four views are left out, and rendered at 64 pixels. The others are shown with 256 at most.
 
     Args:
@@ -96,7 +98,7 @@ def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | Non
     size = max(1, round(truth_views.size[0] * scale)), max(1, round(truth_views.size[1] * scale))
     truth = torch.nn.functional.interpolate(truth_views.images, size, mode="area")
     cameras = camera.resized(truth_views.cameras, *size)
-    fields: list[Renderable] = [model.adapt(remaining), NearestView().adapt(remaining)]
+    fields: list[Renderable] = [model.adapt(remaining).without_residuals(), NearestView().adapt(remaining)]
     first, second = (float(psnr(each.render(cameras).images.clamp(0, 1), truth).mean()) for each in fields)
     return first, second
 

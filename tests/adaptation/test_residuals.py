@@ -2,20 +2,26 @@
 
 import copy
 import math
+from dataclasses import replace
 from itertools import pairwise
 from threading import Thread
 
 import pytest
 import torch
 
-from hyperplanes.adaptation import ResidualField, WithResiduals, residuals
+from hyperplanes.adaptation import CorrectedField, HyperPlanes, ResidualField, residuals
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.kept import keep_field, recall_field
+from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast
 from hyperplanes.rendering import RayMarching
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
+from tests.adaptation import test_stacking
 from tests.reference_rendering import ball_views, camera_at, ring
 
 SIZE = (24, 24)
@@ -218,18 +224,6 @@ def test_from_the_other_side_alone_nothing_is_known():
     assert torch.equal(ResidualField(grey, back).render(asked).images, grey.render(asked).images.clamp(0, 1))
 
 
-def test_a_method_is_corrected_object_by_object(support, query):
-    class Grey:
-        def adapt(self, support):
-            return ball((0.5, 0.5, 0.5))
-
-    found = WithResiduals(Grey()).adapt(support)
-    assert torch.equal(
-        found.render(query.cameras).images,
-        ResidualField(ball((0.5, 0.5, 0.5)), support).render(query.cameras).images,
-    )
-
-
 def test_a_corrected_field_can_be_corrected_again(support, query):
     """By a thread of its own, which would wait for itself."""
     found = []
@@ -238,3 +232,55 @@ def test_a_corrected_field_can_be_corrected_again(support, query):
     thread.start()
     thread.join(30)
     assert len(found) == 1
+
+
+def model(**settings):
+    """A model whose pictures are corrected."""
+    made = HyperPlanes(replace(test_stacking.CONFIG, stacked=False, residuals=True, **settings))
+    made.load_state_dict(test_stacking.model().state_dict(), strict=False)
+    return made.eval()
+
+
+@pytest.fixture(scope="module")
+def many():
+    """As many views as correct the pictures of such a model."""
+    return ball_views(ring(MANY_VIEWS, SIZE))
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 0.7])
+def test_a_model_corrects_the_pictures_of_its_fields(many, query, azimuth):
+    field = model(azimuth=azimuth).adapt(many)
+    plain = field.without_residuals()
+    found = field.render(query.cameras).images
+    torch.testing.assert_close(found, ResidualField(plain, many).render(query.cameras).images)
+    assert (found - plain.render(query.cameras).images).abs().max() > 0.02
+    for options in ({"sampling": RayMarching(12)}, {"antialias": False}):
+        assert torch.equal(field.render(query.cameras, **options).images, plain.render(query.cameras, **options).images)
+    rays, _, _ = query.rays_at(torch.arange(40))
+    assert torch.equal(field.trace(rays).colour, plain.trace(rays).colour)
+    assert not isinstance(field.with_sampling(RayMarching(12)), CorrectedField)
+
+
+def test_pictures_of_few_or_large_views_and_those_without_masks_stay_as_they_are(many, monkeypatch):
+    assert isinstance(model().adapt(many), CorrectedField)
+    for others in (many[: MANY_VIEWS - 1], replace(many, masks=None)):
+        assert not isinstance(model().adapt(others), CorrectedField)
+    assert not isinstance(test_stacking.model().adapt(many), CorrectedField)
+    monkeypatch.setattr(residuals, "MOST_PIXELS", MANY_VIEWS * SIZE[0] * SIZE[1] - 1)
+    assert not isinstance(model().adapt(many), CorrectedField)
+
+
+def test_gradient_steps_random_weights_and_the_update_of_another_object_are_corrected_too(many):
+    adapter, other = model(), ball_views(ring(MANY_VIEWS, SIZE), colour=(0.1, 0.3, 0.9))
+    assert isinstance(FineTuned(adapter, 1).adapt(many), CorrectedField)
+    assert isinstance(FromScratch(adapter, 1).adapt(many), CorrectedField)
+    assert isinstance(Swapped(adapter, [many, other]).adapt(many), CorrectedField)
+
+
+def test_a_field_that_was_kept_is_corrected_as_it_was(many, query, tmp_path):
+    adapter = model(azimuth=0.7)
+    field = adapter.adapt(many)
+    keep_field(adapter, field, tmp_path / "kept")
+    found = recall_field(tmp_path / "kept", many)
+    assert isinstance(found, CorrectedField)
+    torch.testing.assert_close(found.render(query.cameras).images, field.render(query.cameras).images)
