@@ -55,16 +55,15 @@ MORE = {"baked": ["--objects", "2", "--query", "4", "--counts", "25", "3"]}
 """Options of those beside --data."""
 
 _METHODS = ["--methods", "nearest_view", "hull_blend", "hull_blend_reflected", "unreflected"]
-_TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", *_METHODS]
+_TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", *_METHODS, "uncorrected"]
 _TUNED = ["--counts", "3", "25", "--query", "2", "--steps", "100", "--methods", "hull_blend"]
-_RESIDUALS = ["--query", "2", "--methods", "hull_blend", "uncorrected"]
 OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_procedural": (["procedural"], _TEN),
     "views_cc0": (["cc0"], _TEN),
     "views_random": (["random"], [*_TEN, "swapped"]),
     "views_posed": (
         ["posed"],
-        ["--query", "5", "--counts", "1", "3", "5", "25", "50", *_METHODS],
+        ["--query", "5", "--counts", "1", "3", "5", "25", "50", *_METHODS, "uncorrected"],
     ),
     "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "5", *_METHODS]),
     "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "5", *_METHODS]),
@@ -73,8 +72,6 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
         ["--objects", "5", "--query", "2", "--counts", "2", "3", "5", "12", "--rotated", "33"]
         + ["--methods", "hull_blend", "hull_blend_reflected", "unreflected", "unrotated"],
     ),
-    "views_residuals": (["procedural", "cc0", "random"], ["--objects", "10", "--counts", "25", *_RESIDUALS]),
-    "views_residuals_posed": (["posed"], ["--counts", "25", "50", *_RESIDUALS]),
     "views_tuned": (["procedural", "cc0", "random"], ["--objects", "10", *_TUNED]),
     "views_tuned_posed": (["posed"], ["--seeds", "5", *_TUNED]),
 }

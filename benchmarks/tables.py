@@ -319,7 +319,7 @@ SOURCES = {
     "views": OF_VIEWS,
     "views_over": OF_VIEWS,
     "views_srn": ("views_srn", "views_srn_2"),
-    "views_residuals": ("views_residuals", "views_residuals_posed"),
+    "views_residuals": OF_VIEWS,
     "views_tuned": ("views_tuned", "views_tuned_posed"),
     "views_summary": OF_VIEWS,
 }
