@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
-from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils._pytree import tree_map
 
 __all__ = ["AVAILABLE", "NAME", "register", "second_device"]
 
@@ -66,7 +66,7 @@ class _Operations(TorchDispatchMode):
 
     def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
-        if _is_second(kwargs.get("device")) or _remote(args, kwargs):
+        if _is_second(kwargs.get("device")) or any(isinstance(each, _Remote) for each in _tensors(args, kwargs)):
             return _computed(operator, args, kwargs)
         return operator(*args, **kwargs)
 
@@ -93,10 +93,10 @@ class _Functions(TorchFunctionMode):
 
 def _computed(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     """What an operator makes of tensors of the second device, or there."""
-    remote = _remote(args, kwargs)
+    tensors = _tensors(args, kwargs)
+    remote = any(isinstance(each, _Remote) for each in tensors)
     if remote and operator not in _MOVING:
-        given = [args[0], *args[2:3]] if operator in _INDEXING else tree_leaves((args, kwargs))
-        for value in given:
+        for value in [args[0], *args[2:3]] if operator in _INDEXING else tensors:
             if isinstance(value, Tensor) and value.ndim and not isinstance(value, _Remote):
                 raise RuntimeError(
                     f"Expected all tensors to be on the same device, got {tuple(value.shape)} on {value.device} for "
@@ -105,7 +105,8 @@ def _computed(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any
     asked = kwargs.get("device")
     if asked is not None:
         kwargs["device"] = torch.device("cpu")
-    held_args, held_kwargs = tree_map(_held, (args, kwargs))
+    held_args = [_held(each) for each in args]
+    held_kwargs = {name: _held(each) for name, each in kwargs.items()}
     if operator is _ATEN.copy_.default:
         held_args[0].copy_(held_args[1])
         return args[0]
@@ -117,11 +118,16 @@ def _computed(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any
 
 
 def _held(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_held(each) for each in value]
     return value.held if isinstance(value, _Remote) else value
 
 
-def _remote(args: Sequence[Any], kwargs: Mapping[str, Any]) -> bool:
-    return any(isinstance(value, _Remote) for value in tree_leaves((args, kwargs)))
+def _tensors(args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Tensor]:
+    """Those among the arguments of an operator, and in lists among them: it has no other ones."""
+    values = [*args, *kwargs.values()]
+    lists = [each for each in values if isinstance(each, list | tuple)]
+    return [each for value in (values, *lists) for each in value if isinstance(each, Tensor)]
 
 
 def _is_second(device: Any) -> bool:

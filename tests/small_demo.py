@@ -6,23 +6,38 @@ import functools
 import os
 import shutil
 import tempfile
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from rendered_here import rendered_here
+from small_packaged import small_packaged
 
 from hyperplanes.cli import main
 from hyperplanes.experiments.configurations import configuration
 from hyperplanes.experiments.demonstration.settings import DemoSettings
 
+FEW = {"steps": 10, "frames": 2, "tuning": (0, 2)}
+
+
+@contextmanager
+def small_demo():
+    """While this lasts, `hyperplanes demo --quick-check` trains, fine-tunes and shows half as much or less."""
+    usual = DemoSettings.quick_check
+    with rendered_here(), small_packaged(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DemoSettings, "quick_check", lambda seed=0: replace(usual(seed), **FEW))
+        yield
+
 
 @functools.cache
 def demo_folder():
-    """The folder of `hyperplanes demo --quick-check`: a copy of its own for every process of the tests."""
+    """The folder of `hyperplanes demo --quick-check` in `small_demo`: a copy for every process of the tests."""
     shared = Path(os.environ["HYPERPLANES_TESTS"])
     with open(shared / "lock", "w", encoding="utf-8") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # whoever comes first makes it
         if not (shared / "demo").exists():
-            with rendered_here():
+            with small_demo():
                 assert main(["demo", "--quick-check", "--out", str(shared / "unfinished")]) == 0
             (shared / "unfinished").rename(shared / "demo")
     folder = Path(tempfile.mkdtemp(prefix="hyperplanes-demo-"))
@@ -32,7 +47,7 @@ def demo_folder():
 
 def demo_preset():
     """The model and the training of that demonstration."""
-    settings = DemoSettings.quick_check()
+    settings = replace(DemoSettings.quick_check(), **FEW)
     trained = next(each for each in settings.table.trainings if each.method == "hyperplanes")
     return configuration(settings.table, trained, settings.scale, settings.objects, settings.seed)
 

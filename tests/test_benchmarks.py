@@ -21,6 +21,7 @@ from benchmarks import all as all_benchmarks
 from benchmarks.load import OF_SPEED
 from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes, stacking
+from hyperplanes.rendering import RayMarching
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.utilities.environment import usable_cores
 from hyperplanes.utilities.files import DataError
@@ -33,7 +34,8 @@ def test_every_weight_of_every_variant_is_trained(name):
     made = image_based.configured(name, 4, 0)
     small = replace(made.model.network, depth=2, width=16, planes=3)
     model = HyperPlanes(replace(made.model, network=small, hull_resolution=16))
-    trainer = Trainer(model, Balls(views=6, size=(24, 24)), replace(made.training, rays=48, views=(3, 5), episodes=4))
+    training = replace(made.training, tasks=1, rays=48, views=(3, 5), episodes=4)
+    trainer = Trainer(model, Balls(views=6, size=(24, 24)), training)
     for _ in range(3):  # outputs of a hypernetwork that start at zero let nothing through in the first step
         trainer.take_step()
     dead = {key for key, value in model.named_parameters() if value.grad is None or not value.grad.any()}
@@ -59,14 +61,14 @@ def test_a_model_without_its_gate_is_stacked_by_one_share(monkeypatch):
 @pytest.mark.parametrize(("method", "option"), [("one_ray", "antialias"), ("single_precision", "mixed_precision")])
 def test_pictures_by_another_option_are_those_of_the_same_field(method, option):
     field = types.SimpleNamespace(render=lambda cameras, **options: (cameras, options))
-    model = types.SimpleNamespace(adapt=lambda support: field)
+    model = types.SimpleNamespace(adapt=lambda support: types.SimpleNamespace(without_residuals=lambda: field))
     assert views.METHODS[method](model).adapt("views").render("cameras") == ("cameras", {option: False})
 
 
 def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
-    HyperPlanes(MODEL).save(tmp_path / "model")
+    HyperPlanes(replace(MODEL, sampling=RayMarching(8), hull_resolution=16)).save(tmp_path / "model")
     options = ["--checkpoint", str(tmp_path / "model"), "--data", str(demo_folder() / "data"), "--objects", "1"]
-    options += ["--query", "1", "--methods", "ungated", "residuals", "--counts", "1", "2", "--steps", "1", "--coarse"]
+    options += ["--query", "1", "--methods", "ungated", "uncorrected", "--counts", "1", "2", "--steps", "1", "--coarse"]
     found = []
     for seeds in ("1", "2"):
         assert views.main([*options, "--seeds", seeds, "--json", str(tmp_path / "rows.json")]) == 0
@@ -80,14 +82,13 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
             assert one["over_scratch_1"] == pytest.approx(one["psnr"] - scratch["psnr"])
     quality = {(row["views"], row["name"]): row["psnr"] for row in found[0]}
     for row in found[0]:  # what is corrected beside what is not
-        if row["name"].endswith("residuals"):
-            uncorrected = row["name"].removesuffix("residuals").removesuffix("_") or "one_step"
+        if row["name"] in ("one_step", "1_steps"):
+            uncorrected = "uncorrected" if row["name"] == "one_step" else "1_steps_uncorrected"
             assert row[f"over_{uncorrected}"] == pytest.approx(row["psnr"] - quality[row["views"], uncorrected])
     rows = [(row["views"], row["name"]) for row in found[0]]
-    both = ["ungated", "one_step"]
-    tuned = ["1_steps", "1_steps_ungated", "1_steps_coarse"]
-    corrected = ["residuals", "1_steps_residuals"]
-    expected = {1: [*both, "residuals"], 2: ["scratch_1", "scratch_1_coarse", *both, *tuned, *corrected]}
+    both, tuned = ["ungated", "one_step"], ["1_steps", "1_steps_ungated", "1_steps_coarse"]
+    references = ["uncorrected", "1_steps_uncorrected", "scratch_1", "scratch_1_coarse"]
+    expected = {1: ["uncorrected", *both], 2: [*references, *both, *tuned]}
     assert rows == [(count, name) for count, names in expected.items() for name in names]
 
 
@@ -130,7 +131,7 @@ def test_rows_are_of_numbers_of_views_that_were_shown(monkeypatch, capsys):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_parts_of_a_step_are_those_that_its_table_names(threads):
-    trainer = Trainer(HyperPlanes(MODEL), Balls(), TrainingConfig(tasks=2, rays=16, views=(1, 3)))
+    trainer = Trainer(HyperPlanes(MODEL), Balls(), TrainingConfig(tasks=1, rays=16, views=(1, 3)))
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(threads)

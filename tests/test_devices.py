@@ -1,13 +1,15 @@
 """Source of truth: the CPU, whose results a GPU has within rounding, and so has a device made of the CPU's memory."""
 
+import copy
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
 from second_device import AVAILABLE, second_device
 
-from hyperplanes.adaptation import HyperPlanes, canonical_frame
+from hyperplanes.adaptation import HyperPlanes, canonical_frame, symmetry
 from hyperplanes.adaptation.canonical_frame import Placed
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.judging_symmetry import SymmetryJudge
@@ -27,103 +29,123 @@ from hyperplanes.views import Task
 CPU = torch.device("cpu")
 HAS_GPU = torch.cuda.is_available()
 pytestmark = pytest.mark.skipif(not (HAS_GPU or AVAILABLE), reason="needs a GPU, or PyTorch with backends in Python")
+ALL_SAMPLES = RayMarching(32, 0.0)
+"""Rays do not stop: all samples have gradients, none of which is drawn."""
 PLAIN = {"antialias": False, "mixed_precision": False}
 ACROSS = Plane((1.0, 0.0, 0.0), 0.0)
 
 
-@pytest.fixture
-def device():
-    with nullcontext(torch.device("cuda")) if HAS_GPU else second_device() as other:
-        yield other
+def other_device():
+    return nullcontext(torch.device("cuda")) if HAS_GPU else second_device()
 
 
-def car(device, shown=3, size=24):
-    task = read_task("example-car")
+def on_both(compute):
+    """What a function of a device returns for the other device and for the CPU."""
+    expected = compute(CPU)
+    with other_device() as device:
+        return compute(device), expected
+
+
+@cache
+def example():
+    return read_task("example-car")
+
+
+def car(device, shown=3, size=16):
+    task = example()
     support, query = (
         each.resized(size).to(device) for each in (task.support[:: len(task.support) // shown], task.query[:1])
     )
     return Task(support[:shown], query, task.name)
 
 
-def small(device, stop=0.0):
-    """Without a `stop` all samples have gradients, none of which is drawn."""
-    model = HyperPlanes.from_pretrained("small").to(device)
-    sampling = RayMarching(64, stop)
-    model.config = replace(model.config, symmetric=False, hull_resolution=24, sampling=sampling, learned_steps=1)
+@cache
+def pretrained():
+    return HyperPlanes.from_pretrained("small")
+
+
+def small(device, **changes):
+    model = copy.deepcopy(pretrained()).to(device)
+    coarse = {"symmetric": False, "hull_resolution": 16, "sampling": ALL_SAMPLES, "learned_steps": 1}
+    model.config = replace(model.config, **coarse | changes)
     return model
 
 
-def test_operands_on_two_devices_are_refused(device):
-    there = torch.ones(2, 3, device=device)
-    assert (there + 1).device.type == device.type
-    with pytest.raises(RuntimeError, match="Expected all tensors to be on the same device"):
-        there + torch.ones(2, 3)
-    with pytest.raises(TypeError, match="to numpy"):
-        there.numpy()
+def test_operands_on_two_devices_are_refused():
+    with other_device() as device:
+        there = torch.ones(2, 3, device=device)
+        assert (there + 1).device.type == device.type
+        with pytest.raises(RuntimeError, match="Expected all tensors to be on the same device"):
+            there + torch.ones(2, 3)
+        with pytest.raises(TypeError, match="to numpy"):
+            there.numpy()
 
 
-def test_lookups_and_their_gradients(device):
+def test_lookups_and_their_gradients():
     def pulled(where):
         support = car(where).support
         points = torch.linspace(-0.4, 0.4, 60).reshape(20, 3).to(where).requires_grad_()
         found = ImagePlanes(support.images, support.cameras, exact=True).lookup(points, return_directions=True)
         return torch.cat([found.colours.flatten(), *torch.autograd.grad(found.colours.square().sum(), points)[0]])
 
-    torch.testing.assert_close(pulled(device).cpu(), pulled(CPU), atol=1e-3, rtol=1e-4)
+    found, expected = on_both(pulled)
+    torch.testing.assert_close(found.cpu(), expected, atol=1e-3, rtol=1e-4)
 
 
-def test_one_step_shows_the_same_picture(device):
+def test_one_step_shows_the_same_picture():
     def shown(where):
         task = car(where, shown=5)
         return small(where).adapt(task.support).render(task.query.cameras, **PLAIN)
 
-    found, expected = shown(device), shown(CPU)
-    assert found.images.device.type == device.type
+    found, expected = on_both(shown)
+    assert found.images.device.type != "cpu"
     assert float((found.images.cpu() - expected.images).square().mean()) < 1e-5
     assert float(expected.opacity.mean()) > 0.05
 
 
-def test_gradient_steps_end_with_the_same_weights(device):
+def test_gradient_steps_end_with_the_same_weights():
     def tuned(where):
         task = car(where)
         return small(where).fine_tune(task.support, 2).render(task.query.cameras, **PLAIN).images
 
-    assert float((tuned(device).cpu() - tuned(CPU)).square().mean()) < 1e-4
+    found, expected = on_both(tuned)
+    assert float((found.cpu() - expected).square().mean()) < 1e-4
 
 
-def test_rays_that_end_where_they_are_opaque_are_shown_alike(device):
+def test_rays_that_end_where_they_are_opaque_are_shown_alike():
     """On the CPU in rounds, until little light is left; elsewhere all samples at once, with gradients or without.
 
     The weights are those of the forward pass: learned steps read gradients of such rays, and end 1.5 % apart.
     """
-    pixels = []
-    for where in (CPU, device):
-        task = car(where)
-        model = small(where, stop=5e-3)
-        model.config = replace(model.config, learned_steps=0)
-        field = model.adapt(task.support)
+
+    def shown(where):
+        task, finer = car(where, size=24), {"hull_resolution": 24, "sampling": RayMarching(64, 5e-3)}
+        field = small(where, **finer, learned_steps=0).adapt(task.support)
         rays, _ = task.query.sample_rays(150, generator=torch.Generator().manual_seed(0))
         placed = len(field.sampling.place(rays, field.occupancy))
         drawn = torch.Generator().manual_seed(1)
         with torch.enable_grad():
             found = [field.trace(rays, differentiable=False), field.trace(rays, drawn)]
-        pixels.append([each.colour.detach().cpu() for each in found])
-        assert found[0].samples == placed if where == device else found[0].samples < placed
-    for here, there in zip(*pixels, strict=True):
+        assert found[0].samples < placed if where == CPU else found[0].samples == placed
+        return [each.colour.detach().cpu() for each in found]
+
+    for there, here in zip(*on_both(shown), strict=True):
         assert float((here - there).square().mean()) < 1e-6
 
 
-def test_planes_of_symmetry_are_found(device):
+def test_planes_of_symmetry_are_found():
     def found(where):
         support = car(where, shown=12, size=32).support
         hull = carve(support.masks, support.cameras, support.bounds, 32)
         planes = [most_symmetric_plane(hull), more_symmetric_plane(hull, ACROSS)]
         return torch.tensor([[*plane.normal, plane.offset] for plane in planes])
 
-    torch.testing.assert_close(found(device), found(CPU), atol=0.02, rtol=0)
+    torch.testing.assert_close(*on_both(found), atol=0.02, rtol=0)
 
 
-def test_planes_are_judged_alike(device):
+def test_planes_are_judged_alike(monkeypatch):
+    monkeypatch.setattr(symmetry, "PIXELS", 256)
+
     def judged(where):
         support = car(where, shown=4, size=16).support
         return [
@@ -131,10 +153,11 @@ def test_planes_are_judged_alike(device):
             Fold.of(support, [1]).error(Symmetry(ACROSS)),
         ]
 
-    assert judged(device) == pytest.approx(judged(CPU), rel=0.02)
+    found, expected = on_both(judged)
+    assert found == pytest.approx(expected, rel=0.02)
 
 
-def test_frames_are_judged_alike_and_rotated_fields_shown_alike(device):
+def test_frames_are_judged_alike_and_rotated_fields_shown_alike():
     def judged(where):
         task, model = car(where, shown=3, size=16), small(where)
         placed = Placed(Rotation(0.5).views(task.support), None, Rotation(0.5))
@@ -143,25 +166,26 @@ def test_frames_are_judged_alike_and_rotated_fields_shown_alike(device):
         centres = field.occupancy.centres()
         return canonical_frame._quality(model, placed, 1), float(field.density(centres).detach().mean()), picture
 
-    (quality, density, picture), expected = judged(device), judged(CPU)
+    (quality, density, picture), expected = on_both(judged)
     assert (quality, density) == pytest.approx(expected[:2], rel=0.02)
     assert float((picture - expected[2]).square().mean()) < 1e-4
 
 
-def test_the_hull_of_views_and_reflections_looks_the_same(device):
+def test_the_hull_of_views_and_reflections_looks_the_same():
     def shown(where):
         task = car(where)
         return (
-            HullBlend()
+            HullBlend(side=32, steps=64)
             .adapt(with_reflections(task.support, Symmetry(ACROSS)))
             .render(task.query.cameras, **PLAIN)
             .images
         )
 
-    assert float((shown(device).cpu() - shown(CPU)).square().mean()) < 1e-4
+    found, expected = on_both(shown)
+    assert float((found.cpu() - expected).square().mean()) < 1e-4
 
 
-def test_a_training_step_has_the_same_loss(device):
+def test_a_training_step_has_the_same_loss():
     class One:
         def names(self, split):
             return ["car"] if split == "train" else []
@@ -173,10 +197,11 @@ def test_a_training_step_has_the_same_loss(device):
         settings = replace(preset("small").training, prefetch=0, tasks=1, rays=32, precision="single")
         return Trainer(small(where), One(), settings).take_step()
 
-    assert loss(device) == pytest.approx(loss(CPU), rel=1e-3)
+    found, expected = on_both(loss)
+    assert found == pytest.approx(expected, rel=1e-3)
 
 
-def test_voxels_are_baked_from_it(device):
-    values = [bake(small(where).adapt(car(where).support), side=24).values for where in (device, CPU)]
-    assert values[0].device.type == "cpu"
-    assert abs(len(values[0]) - len(values[1])) <= 0.02 * len(values[1])
+def test_voxels_are_baked_from_it():
+    found, expected = on_both(lambda where: bake(small(where).adapt(car(where).support), side=16).values)
+    assert found.device.type == "cpu"
+    assert abs(len(found) - len(expected)) <= 0.02 * len(expected)

@@ -44,6 +44,7 @@ NAMED = re.compile(r"(hyperplanes|data_gen|benchmarks)(\.[a-z]\w*)+(:\w+|\.)?")
 """A string that names a module, one of its objects, or where a name in braces goes on."""
 
 
+@cache
 def unit(module):
     """The entry of LAYERS that a module belongs to: its own name or that of its package."""
     parts = module.split(".")
@@ -64,18 +65,27 @@ def modules():
 
 
 @cache
-def parsed(path):
-    return ast.parse(path.read_text(encoding="utf-8"))
+def examined(path):
+    """The modules of ours that a file imports, at its top, in a function or by a string; and if it says what is public.
+
+    Its tree is not kept: the garbage collector would look at all of them again and again.
+    """
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return list(_imported(path, tree)), _says_what_is_public(path, tree)
 
 
-@cache
 def imported(path):
-    """Every module of ours that a file imports, at its top or in a function, or that it names in a string."""
-    return list(_imported(path))
+    return examined(path)[0]
 
 
-def _imported(path):
-    for node in ast.walk(parsed(path)):
+def _says_what_is_public(path, tree):
+    defines = any(isinstance(node, ast.FunctionDef | ast.ClassDef | ast.ImportFrom) for node in tree.body)
+    assigned = [ast.unparse(node.targets[0]) for node in tree.body if isinstance(node, ast.Assign)]
+    return not defines or "__all__" in assigned or path.name == "__main__.py"
+
+
+def _imported(path, tree):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and NAMED.fullmatch(node.value):
             name = node.value.partition(":")[0].removesuffix(".")
             if is_module(name):  # and no group of entry points
@@ -111,8 +121,8 @@ def test_imports_run_down():
             there = unit(target) if target.split(".")[0] in OURS else None
             if there is None or there == here:
                 continue
-            siblings = is_package(there) and is_package(here)
-            if LAYERS[there] > LAYERS[here] or (LAYERS[there] == LAYERS[here] and siblings):
+            siblings = LAYERS[there] == LAYERS[here] and is_package(there) and is_package(here)
+            if LAYERS[there] > LAYERS[here] or siblings:
                 wrong.append(f"{name} (layer {LAYERS[here]}) imports {target} (layer {LAYERS[there]})")
     assert wrong == []
 
@@ -140,11 +150,4 @@ def test_the_renderer_knows_no_field():
 
 
 def test_every_module_says_what_is_public():
-    silent = []
-    for name, path in modules():
-        tree = parsed(path)
-        defines = any(isinstance(node, ast.FunctionDef | ast.ClassDef | ast.ImportFrom) for node in tree.body)
-        assigned = [ast.unparse(node.targets[0]) for node in tree.body if isinstance(node, ast.Assign)]
-        if defines and "__all__" not in assigned and path.name != "__main__.py":
-            silent.append(name)
-    assert silent == []
+    assert [name for name, path in modules() if not examined(path)[1]] == []

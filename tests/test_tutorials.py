@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from rendered_here import rendered_here
+from small_packaged import small_packaged
 
 from hyperplanes.cli import main
 
@@ -22,11 +23,11 @@ def cells(path):
 def test_the_tutorial_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {}
-    for cell in cells(path):
-        code, _, command = cell.partition("!hyperplanes ")  # what follows goes to the shell in a notebook
-        exec(code, names)
-        if command:
-            with rendered_here():
+    with rendered_here(), small_packaged():
+        for cell in cells(path):
+            code, _, command = cell.partition("!hyperplanes ")  # what follows goes to the shell in a notebook
+            exec(code, names)
+            if command:
                 assert main(shlex.split(command.format(**names))) == 0, cell
 
 

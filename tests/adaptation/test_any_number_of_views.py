@@ -233,7 +233,7 @@ def test_a_single_view_is_not_fine_tuned_on_unless_it_may_be_copied():
         with pytest.raises(ValueError, match="steps: expected 0 with a single view"):
             adapter.fine_tune(views(1), steps)
     adapter.fine_tune(views(1), 0)
-    adapter.fine_tune(views(1), 1, FineTuning(mask_views=False))
+    adapter.fine_tune(views(1), 1, FineTuning(mask_views=False, rays=16))
 
 
 @pytest.mark.parametrize("draw", ["uniform", "contrast"])
@@ -277,11 +277,12 @@ def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is(reader, fr
 def test_steps_from_nothing_but_fresh_weights_are_those_from_random_ones():
     adapter, support = model(**READERS["volume"]), views(4)
     cameras = ring(2, (10, 13), shift=1)
-    fresh = adapter.fine_tune(support, 3, FineTuning(fresh=1.0)).render(cameras).images
-    assert torch.equal(fresh, FromScratch(adapter, 3).adapt(support).render(cameras).images)
-    none = adapter.fine_tune(support, 3, FineTuning(fresh=0.0)).render(cameras).images
+    fresh = adapter.fine_tune(support, 3, FineTuning(fresh=1.0, rays=64)).render(cameras).images
+    assert torch.equal(fresh, FromScratch(adapter, 3, FineTuning(rays=64)).adapt(support).render(cameras).images)
+    none = adapter.fine_tune(support, 3, FineTuning(fresh=0.0, rays=64)).render(cameras).images
     assert not torch.allclose(fresh, none, atol=1e-3)
-    assert torch.equal(none, adapter.fine_tune(support, 3).render(cameras).images)  # with few views, as before
+    plain = adapter.fine_tune(support, 3, FineTuning(rays=64))
+    assert torch.equal(none, plain.render(cameras).images)  # with few views, as before
     assert FineTuning().fresh_share(MANY_VIEWS) == FRESH
     with pytest.raises(ValueError, match="fresh: expected a share"):
         FineTuning(fresh=1.5)
@@ -322,7 +323,7 @@ def test_the_weights_of_one_object_make_its_field_and_its_surface_again(free):
     adapter, support = model(**READERS["volume"]), views(6)
     with torch.no_grad():
         adapter.targets["fine"].density.bias.sub_(HAZE - 1)
-    tuned = adapter.fine_tune(support, 5, FineTuning(free, rays=256))
+    tuned = adapter.fine_tune(support, 3, FineTuning(free, rays=64))
     cameras = ring(2, (10, 13), shift=1)
     again = adapter.with_weights_of(tuned).adapt(support).render(cameras).images
     torch.testing.assert_close(again, tuned.render(cameras).images, atol=1e-6, rtol=0)

@@ -48,7 +48,7 @@ def scene():
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
-    for name, value in (("LEVELS", ((SIDE, 16, 16, 120),)), ("RAYS", 384), ("BEFORE", 4), ("BEHIND", 24)):
+    for name, value in (("LEVELS", ((SIDE, 16, 16, 60),)), ("RAYS", 384), ("BEFORE", 4), ("BEHIND", 24)):
         monkeypatch.setattr(background, name, value)
 
 
@@ -59,6 +59,7 @@ def overlap(views, outlines):
 
 def test_the_object_is_cut_out_of_views_that_were_fitted_and_of_others(scene, capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path))
+    monkeypatch.setattr(background, "LEVELS", ((SIDE, 16, 16, 120),))
     views, outlines = scene
     task = Task(views[:11], views[11:], "ball")
     found = cut_out_task(task, Console())
@@ -76,7 +77,6 @@ def test_the_object_is_cut_out_of_views_that_were_fitted_and_of_others(scene, ca
 def test_view_shows_the_object_alone(scene, monkeypatch, tmp_path):
     """What the page shows, and the model adapts to, is the ball, over white; viser and the model have no part in it."""
     monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(background, "LEVELS", ((SIDE, 16, 16, 60),))
     views, outlines = scene
     poses = torch.linalg.inv(camera.camera_from_world(views.cameras).double()).numpy()
     lenses = camera.intrinsics(views.cameras).double().numpy()

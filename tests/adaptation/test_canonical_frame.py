@@ -28,7 +28,7 @@ from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.rendering.scene import SplitField
 from hyperplanes.utilities.metrics import psnr
 from tests.adaptation.test_stacking import CONFIG
-from tests.adaptation.test_symmetry import ACROSS, BODY, SIZE, balls, cameras, model
+from tests.adaptation.test_symmetry import ACROSS, BODY, SMALL, balls, cameras, model
 from tests.reference_rendering import ring
 
 ANGLE = 0.7
@@ -40,7 +40,7 @@ def made(**changes):
     adapter = model(**changes)
     with torch.no_grad():
         adapter.theta["fine.density.bias"].fill_(1.0)
-    return adapter.adapt_to(adapter.prepare(balls(cameras(6), BODY, BESIDE), symmetry=adapter.config.symmetry))
+    return adapter.adapt_to(adapter.prepare(balls(cameras(6, SMALL), BODY, BESIDE), symmetry=adapter.config.symmetry))
 
 
 @pytest.mark.parametrize("hull_share", [0.0, 0.3, 0.9])
@@ -49,7 +49,7 @@ def test_the_field_of_a_rotated_object_is_seen_by_rotated_cameras_as_the_other_o
     rotated = rotation.field(field)
     assert isinstance(rotated, RotatedField)
     assert isinstance(field, StackedField) == bool(hull_share)
-    asked = ring(2, SIZE, shift=1)
+    asked = ring(2, SMALL, shift=1)
     found = rotated.render(camera.moved(asked, rotation.about(BESIDE)))
     expected = field.render(asked)
     for name in ("images", "opacity", "depth"):
@@ -92,7 +92,7 @@ def test_densities_colours_and_rays_of_a_rotated_field_are_those_at_rotated_plac
 
 def test_voxels_of_a_rotated_field_lie_in_the_frame_of_the_scene():
     field, rotation = HullBlend().adapt(balls(cameras(6), BODY, BESIDE)), Rotation(ANGLE)
-    asked = ring(2, SIZE, shift=1)
+    asked = ring(2, SMALL, shift=1)
     expected = BakedScene(bake(field, side=64)).render(asked).images
     rotated = BakedScene(bake(rotation.field(field), side=64))
     found = rotated.render(camera.moved(asked, rotation.about(BESIDE))).images
@@ -126,7 +126,7 @@ def found_by(monkeypatch, qualities, symmetry=ACROSS, count=4, **changes):
     monkeypatch.setattr(canonical_frame, "_quality", quality)
     with torch.no_grad():
         torch.set_num_threads(1)
-        found = find_rotation(model(**changes), balls(cameras(count), BODY), symmetry)
+        found = find_rotation(model(**changes), balls(cameras(count, SMALL), BODY), symmetry)
     return math.degrees(found.angle)
 
 
@@ -173,7 +173,7 @@ def test_what_shows_no_frame_is_left_as_it_faces(monkeypatch):
 
 
 def test_a_quality_is_that_of_a_view_that_is_not_shown(monkeypatch):
-    adapter, views = model(), balls(cameras(), BODY)
+    adapter, views = model(), balls(cameras(4, SMALL), BODY)
     shown = []
     prepare = adapter.prepare
     monkeypatch.setattr(adapter, "prepare", lambda views, **keys: shown.append(views) or prepare(views, **keys))
@@ -188,15 +188,15 @@ def test_a_quality_is_that_of_a_view_that_is_not_shown(monkeypatch):
 @pytest.mark.parametrize("steps", [0, 2])
 def test_a_field_in_its_frame_is_kept_with_it_and_is_in_the_frame_of_the_scene(steps):
     """A rotation that is known shows the same pictures as one of the scene before everything."""
-    views, rotation = balls(cameras(), BODY), Rotation(ANGLE)
-    adapter = model(azimuth=ANGLE)
+    views, rotation = balls(cameras(4, SMALL), BODY), Rotation(ANGLE)
+    adapter = model(azimuth=ANGLE, symmetry=ACROSS)
     with torch.no_grad():
         adapter.theta["fine.density.bias"].fill_(1.0)
     found = adapter.fine_tune(views, steps, FineTuning(rays=64))
     plain = type(adapter)(replace(adapter.config, azimuth=0.0)).eval()
     plain.load_state_dict(adapter.state_dict())
     turned_views = rotation.views(views)
-    plain.config = replace(plain.config, symmetry=rotation.symmetry(adapter.find_symmetry(views), views.bounds))
+    plain.config = replace(plain.config, symmetry=rotation.symmetry(ACROSS, views.bounds))
     expected = plain.fine_tune(turned_views, steps, FineTuning(rays=64)).render(turned_views.cameras).images
     pictures = found.render(views.cameras).images
     assert float(psnr(pictures, expected).min()) > 35
@@ -221,8 +221,8 @@ def test_a_placed_object_is_rotated_with_its_symmetry():
 
 
 def test_another_objects_update_is_shown_in_the_frame_of_the_scene():
-    views, other = balls(cameras(), BODY), balls(cameras(), BODY[:2])
-    found = Swapped(model(azimuth=ANGLE), [views, other]).adapt(views)
+    views, other = balls(cameras(4, SMALL), BODY), balls(cameras(4, SMALL), BODY[:2])
+    found = Swapped(model(azimuth=ANGLE, symmetry=ACROSS), [views, other]).adapt(views)
     assert isinstance(found, RotatedField)
     assert found.rotation == Rotation(-ANGLE)
 
@@ -233,20 +233,21 @@ def test_a_field_that_knows_its_views_by_their_places_has_no_azimuth():
 
 
 def test_views_that_auto_holds_out_are_rotated_with_the_others(monkeypatch):
-    views, settings, seen = balls(cameras(6), BODY), FineTuning(rays=16, max_steps=2), []
+    views, settings, seen = balls(cameras(6, SMALL), BODY), FineTuning(rays=16, max_steps=2), []
     monkeypatch.setattr(Descent, "best_stop", lambda self, holdout, **options: seen.append(holdout) or 1)
-    made_anyway(lambda: model(azimuth=ANGLE).fine_tune(views, "auto", settings))
+    made_anyway(lambda: model(azimuth=ANGLE, symmetry=ACROSS).fine_tune(views, "auto", settings))
     _, expected = split_holdout(Rotation(ANGLE).views(views), settings)
     torch.testing.assert_close(seen[0].cameras.extrinsics, expected.cameras.extrinsics)
 
 
 @pytest.mark.parametrize("angle", [0.0, ANGLE])
 def test_steps_that_lower_nothing_leave_a_field_in_the_frame_of_the_scene(angle, monkeypatch):
-    views, settings = balls(cameras(), BODY), FineTuning(rays=16)
-    expected = made_anyway(lambda: model(azimuth=angle).fine_tune(views, 1, settings))
+    views, settings = balls(cameras(4, SMALL), BODY), FineTuning(rays=16)
+    adapter = model(azimuth=angle, symmetry=ACROSS)
+    expected = made_anyway(lambda: adapter.fine_tune(views, 1, settings))
     monkeypatch.setattr(Descent, "errors", lambda self: (0.0, 0.0))
     with pytest.raises(NoProgressError) as caught:
-        model(azimuth=angle).fine_tune(views, 1, settings)
+        adapter.fine_tune(views, 1, settings)
     found = caught.value.field
     assert isinstance(found, RotatedField) == bool(angle)
     torch.testing.assert_close(found.render(views.cameras).images, expected.render(views.cameras).images)
@@ -254,20 +255,23 @@ def test_steps_that_lower_nothing_leave_a_field_in_the_frame_of_the_scene(angle,
 
 @pytest.mark.parametrize("angle", [0.0, ANGLE])
 def test_a_protocol_is_that_of_a_rotated_field_too(angle):
-    views, sampler = balls(cameras(), BODY), Hierarchical(2, 2)
-    found = WithSampler(model(azimuth=angle, stacked=False), sampler).adapt(views).render(views.cameras)
-    height, width = SIZE
+    views, sampler = balls(cameras(4, SMALL), BODY), Hierarchical(2, 2)
+    adapter = model(azimuth=angle, symmetry=ACROSS, stacked=False)
+    found = WithSampler(adapter, sampler).adapt(views).render(views.cameras)
+    height, width = SMALL
     assert found.samples == len(views) * height * width * (2 + 4)
 
 
-def test_a_model_in_training_stays_in_training_and_learns_nothing_of_the_frame():
+def test_a_model_in_training_stays_in_training_and_learns_nothing_of_the_frame(monkeypatch):
     """Two threads at once, of which the first to end must not switch the other one back."""
+    monkeypatch.setattr(canonical_frame, "PIXELS", 64)
+    views = replace(balls(cameras(2, SMALL), BODY), masks=None)  # without a hull
     adapter, before = HyperPlanes(replace(CONFIG, symmetric=True)).train(), torch.get_num_threads()
     kept = {name: value.clone() for name, value in adapter.state_dict().items()}
     torch.set_num_threads(2)
     try:
         for _ in range(3):
-            find_rotation(adapter, balls(cameras(), BODY), ACROSS)
+            find_rotation(adapter, views, ACROSS)
     finally:
         torch.set_num_threads(before)
     assert all(part.training for part in adapter.modules())
@@ -283,7 +287,7 @@ def test_an_angle_that_is_none_is_refused(angle):
 def test_a_command_says_that_an_object_was_rotated(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path))
     for angle, said in ((ANGLE, True), (0.0, False)):
-        adapt_to(model(azimuth=angle), balls(cameras(), BODY), "balls", Console())
+        adapt_to(model(azimuth=angle, symmetry=ACROSS), balls(cameras(4, SMALL), BODY), "balls", Console())
         assert ("rotated into its canonical frame" in "".join(capsys.readouterr())) == said
 
 

@@ -42,6 +42,12 @@ def support():
     return ball_views(ring(4))
 
 
+@pytest.fixture
+def few_judge(monkeypatch):
+    """Held-out views are judged by fewer rays than users have."""
+    monkeypatch.setattr(descent_module, "HOLDOUT_RAYS", 256)
+
+
 def moved(model, field):
     """Names of the parameters that differ from theta."""
     theta = model.theta.under("fine")
@@ -128,7 +134,7 @@ def test_steps_optimise_a_grid_of_more_cells_which_is_kept_with_the_field(cells,
     model.with_weights_of(tuned).save(tmp_path)
     kept = HyperPlanes.from_pretrained(tmp_path)
     assert kept.config.network.cells == optimised
-    assert torch.equal(kept.adapt(views).render(views.cameras).images, tuned.render(views.cameras).images)
+    assert torch.equal(kept.adapt(views).render(ring(1)).images, tuned.render(ring(1)).images)
     further = kept.fine_tune(views, 1, FineTuning(rays=32, learning_rate=1e-3, cells=64))
     assert further.field.parameters["grid.weight"].shape[-1] == 64
 
@@ -282,6 +288,7 @@ def test_wrong_settings_are_refused(model, support):
         model.fine_tune(support[:2], "auto")
 
 
+@pytest.mark.usefixtures("few_judge")
 def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, support):
     taken, tried = [], []
     ruinous = replace(WEIGHTS, learning_rate=1e30, muon_learning_rate=1e30, max_steps=12)  # NaN after the first step
@@ -292,6 +299,7 @@ def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, s
     assert torch.equal(field.render(cameras).images, model.adapt(support).render(cameras).images)
 
 
+@pytest.mark.usefixtures("few_judge")
 def test_auto_goes_on_where_steps_show_left_out_views_better():
     model, support, taken, tried = awaken(small_model()), ball_views(ring(9)), [], []
     field = model.fine_tune(
@@ -317,7 +325,7 @@ def test_left_out_views_are_neither_planes_nor_rays_while_the_number_of_steps_is
         return sample(self, count, **given)
 
     monkeypatch.setattr(type(support), "sample_rays", sampled)
-    model.fine_tune(support, "auto", replace(WEIGHTS, max_steps=10, holdout=3))
+    model.fine_tune(support, "auto", replace(WEIGHTS, max_steps=2, holdout=3))
     assert [len(views) for views in prepared] == [6, 9]
     assert drawn[0] == (3, 4096)  # the rays that judge
     assert {count for views, count in drawn[1:]} == {64}
@@ -362,6 +370,7 @@ def test_settings_that_cannot_be_are_refused(settings, message):
         FineTuning(**settings)
 
 
+@pytest.mark.usefixtures("few_judge")
 def test_auto_tries_what_it_goes_on_with(monkeypatch):
     decided, made = [], fine_tuning.make_descent
 
@@ -374,18 +383,19 @@ def test_auto_tries_what_it_goes_on_with(monkeypatch):
     model = small_model(target="image_based", hypernetwork=None, network=ImageBasedConfig(depth=2, width=16))
     for count in (9, 10, 23, 24):
         decided.clear()
-        model.fine_tune(ball_views(ring(count, (8, 8))), "auto", FineTuning(rays=16, max_steps=4, learning_rate=1e-4))
+        model.fine_tune(ball_views(ring(count, (8, 8))), "auto", FineTuning(rays=16, max_steps=2, learning_rate=1e-4))
         assert len(decided) == 2
         assert set(decided) == {(0.5, "contrast", 64 * (count >= 20)) if count >= 10 else (0.0, "uniform", 0)}
 
 
+@pytest.mark.usefixtures("few_judge")
 def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
     model, support = awaken(small_model()), ball_views(ring(9))
     shown, holdout = split_holdout(support, WEIGHTS)
     context = model.prepare(shown)
     bounds = support.bounds
     blank = AdaptedField(lambda p, d: (torch.ones_like(p), p.new_zeros(len(p))), full(bounds, 4), RayMarching(24))
-    best = fine_tuning.fine_tune_to(model, context, 60, WEIGHTS)  # better than a few steps
+    best = fine_tuning.fine_tune_to(model, context, 40, WEIGHTS)  # better than a few steps
     stops = [
         make_descent(model, context, replace(WEIGHTS, max_steps=10), shown)[0].best_stop(holdout, unchanged=unchanged)
         for unchanged in (blank, best)

@@ -17,6 +17,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.geometry.rays import cast
 from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.training import gating
 from hyperplanes.training.gating import GatingExample, example_of, fit_gate, turned
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Task
@@ -135,8 +136,10 @@ def test_view_takes_rays_as_render_does_and_shows_fields_that_stay_as_they_are(t
     assert not torch.equal(*viewer.pictures[:2])
 
 
-def test_a_fitted_gate_takes_the_picture_that_is_right():
+def test_a_fitted_gate_takes_the_picture_that_is_right(monkeypatch):
     # Two pictures of noise, of which the first is right where opacity is 1 and the second where it is below a half.
+    monkeypatch.setattr(gating, "EXAMPLES", 4)
+    monkeypatch.setattr(gating, "PIXELS", 256)
     generator = torch.Generator().manual_seed(0)
     examples = []
     for _ in range(2):

@@ -29,12 +29,16 @@ def views():
 @pytest.fixture(scope="module")
 def model():
     model = HyperPlanes.from_pretrained("small")
-    model.config = replace(model.config, hull_resolution=32)
+    model.config = replace(model.config, hull_resolution=16, symmetric=False, azimuth=0.0, learned_steps=1)
     return model
 
 
-def test_a_kept_field_is_the_field(model, views):
-    field = model.adapt(views)
+@pytest.fixture(scope="module")
+def field(model, views):
+    return model.adapt(views)
+
+
+def test_a_kept_field_is_the_field(model, views, field):
     folder = kept_folder(model, views, 0, FineTuning())
     assert recall_field(folder, views) is None
     keep_field(model, field, folder)
@@ -56,8 +60,8 @@ def test_the_folder_is_another_for_other_views_weights_and_options(model, views)
     assert kept_folder(model, views, 0, settings) == folders[0]
 
 
-def test_the_oldest_go(model, views, tmp_path):
+def test_the_oldest_go(model, views, field, tmp_path):
     for number in range(MOST):
         (tmp_path / "adapted" / f"old{number}").mkdir(parents=True)
-    keep_field(model, model.adapt(views), kept_folder(model, views, 0, FineTuning()))
+    keep_field(model, field, kept_folder(model, views, 0, FineTuning()))
     assert len(list((tmp_path / "adapted").iterdir())) == MOST

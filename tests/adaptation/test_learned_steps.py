@@ -1,6 +1,7 @@
 """Source of truth: the gradient of the mean loss by autograd, differences of that loss, and steps that are none."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -191,11 +192,13 @@ def test_training_goes_on_from_the_step_that_the_model_has(monkeypatch):
 def test_training_begins_with_each_of_the_first_steps(monkeypatch):
     """The step that is trained follows none, one, two or three others."""
     followed, adapter = [], stepping(1)
-    monkeypatch.setattr(training, "RAYS", 16)
-    monkeypatch.setattr(
-        training, "step_inputs", lambda *inputs, **options: followed.append(1) or step_inputs(*inputs, **options)
-    )
-    config = TrainingConfig(steps=12, tasks=1, rays=64, views=(2, 3), held_out=0)
-    counts = []
-    fit_learned_step(adapter, Balls(views=6), config, on_step=lambda step, loss: counts.append(len(followed)))
-    assert {after - before for before, after in zip([0, *counts], counts, strict=False)} == {1, 2, 3, 4}
+    read = (None, None, torch.zeros_like(adapter.theta[GRID])[None])
+    monkeypatch.setattr(training, "step_inputs", lambda *inputs, **options: followed.append(1) or read)
+    draw = SimpleNamespace(episode=SimpleNamespace(prepared=None, support_live=None), generator=generator())
+    counts = set()
+    for _ in range(12):
+        followed.clear()
+        _, inputs = training._after_others(adapter, lambda *read: read[2], draw, adapter.theta.detach())
+        counts.add(len(followed))
+        assert inputs is read
+    assert counts == {1, 2, 3, 4}

@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -44,6 +45,8 @@ CONFIG = ModelConfig(
     "image_based", NETWORK, VolumeHyperNetworkConfig(), sampling=RayMarching(24), hull_resolution=16, stacked=True
 )
 
+ACROSS = Symmetry(Plane((1.0, 0.0, 0.0)))
+
 
 def model(seed=0, *, empty=False):
     torch.manual_seed(seed)
@@ -56,11 +59,17 @@ def model(seed=0, *, empty=False):
     return made
 
 
-def both(support):
-    """A learned field and the hull of the same views."""
+def both(support, symmetry=None):
+    """A learned field and the hull of the same views, and of their reflections."""
     adapter = model()
-    context = adapter.prepare(support)
+    context = adapter.prepare(support, symmetry=symmetry)
     return adapter.rendering_field(context, adapter.adapted_weights(context)), HullBlend().adapt_to(context.planes)
+
+
+@cache
+def both_of_reflected():
+    """Those of seven views and their reflections."""
+    return both(ball_views(ring(7, (24, 24))), ACROSS)
 
 
 @pytest.mark.parametrize(("given", "held_out"), [(5, 2), (35, 2), (36, 3), (48, 4)])
@@ -264,14 +273,11 @@ def test_a_field_that_knows_views_by_their_places_is_not_stacked():
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.8, 1.0])
 def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share, gated):
     adapter, support, cameras = model(), ball_views(ring(7, (24, 24))), ring(2, (10, 13), shift=1)
-    symmetry = Symmetry(Plane((1.0, 0.0, 0.0)))  # its reflections are views, too
-    context = adapter.prepare(support, symmetry=symmetry)
-    learned = adapter.rendering_field(context, adapter.adapted_weights(context))
     gate = GatingNetwork() if gated else None
-    stacked = stack(learned, HullBlend().adapt_to(context.planes), share, gate, len(context.views))
+    stacked = stack(*both_of_reflected(), share, gate, views=14)
     keep_field(adapter, stacked, tmp_path / "adapted" / "kept")
     expected = stacked.render(cameras).images
-    assert stacked.symmetry == symmetry
+    assert stacked.symmetry == ACROSS
     for again in (
         adapter.with_weights_of(stacked).adapt(support),
         recall_field(tmp_path / "adapted" / "kept", support),

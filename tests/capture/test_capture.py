@@ -9,11 +9,21 @@ from PIL import Image
 
 from benchmarks.captures import compare_poses
 from benchmarks.staged_photographs import stage, walk_around
+from hyperplanes.capture.masks import consistency
 from hyperplanes.capture.packages import is_installed
 from hyperplanes.capture.scene import straightened
 
 needs_pycolmap = pytest.mark.skipif(not is_installed("pycolmap"), reason="needs pycolmap, of the extra photos")
 VIEWS = 9
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    """Masks are compared with a hull of fewer voxels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(consistency, "COARSE", 40)
+        patch.setattr(consistency, "FINE", 60)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from hyperplanes.capture import Settings, pipeline
+from hyperplanes.capture.masks import consistency
 from hyperplanes.capture.masks.colour import PlainBackground, is_plain
 from hyperplanes.capture.masks.command import Command
 from hyperplanes.capture.masks.network import SalientObject, weights
@@ -83,6 +84,13 @@ def test_the_network_finds_what_stands_out():
     np.testing.assert_allclose(masker(picture[:, ::-1]), found[:, ::-1], atol=1e-3)  # of a mirror image the mirrored
 
 
+@pytest.fixture
+def coarse(monkeypatch):
+    """Hulls of fewer voxels."""
+    monkeypatch.setattr(consistency, "COARSE", 60)
+    monkeypatch.setattr(consistency, "FINE", 100)
+
+
 @pytest.fixture(scope="module")
 def ball_seen():
     """A ball seen by 16 cameras around it: the model, its sphere and its masks."""
@@ -104,8 +112,6 @@ def ball_seen():
 
 
 def test_masks_that_agree_are_left_alone(ball_seen, monkeypatch):
-    from hyperplanes.capture.masks import consistency
-
     monkeypatch.setattr(consistency, "COARSE", 40)
     monkeypatch.setattr(consistency, "FINE", 72)
     model, sphere, masks = ball_seen
@@ -115,8 +121,8 @@ def test_masks_that_agree_are_left_alone(ball_seen, monkeypatch):
         np.testing.assert_array_equal(before, after)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_masks_damaged_on_purpose_are_named_and_mended(ball_seen):
-    from hyperplanes.capture.masks.consistency import agree
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.geometry.occupancy import carve
 
@@ -125,7 +131,7 @@ def test_masks_damaged_on_purpose_are_named_and_mended(ball_seen):
     damaged[2][:, :48] = 0  # half of it is missing
     damaged[9][38:58, 38:58] = 0  # a hole
     damaged[13][5:25, 70:92] = 1  # something else beside it
-    found = agree(damaged, model, sphere)
+    found = consistency.agree(damaged, model, sphere)
     assert found.wrong == [2, 9, 13]
     assert min(overlap(mended, mask > 0.5) for mended, mask in zip(found.masks, masks, strict=True)) > 0.9
     import torch
@@ -141,6 +147,7 @@ def test_masks_damaged_on_purpose_are_named_and_mended(ball_seen):
     assert abs(volume[2] / volume[0] - 1) < 0.05
 
 
+@pytest.mark.usefixtures("coarse")
 def test_masks_that_came_with_photographs_stay_as_they_are_beside_others(ball_seen, tmp_path, monkeypatch):
     model, _, masks = ball_seen
     damaged = [mask.copy() for mask in masks]

@@ -204,7 +204,8 @@ def test_fields_are_sampled_as_their_models_are_trained(name, tmp_path, monkeypa
     reader = {"model.hypernetwork.encoder": "convnet", "model.hypernetwork.width": 8, "model.hull_resolution": 8}
     scale = SCALES[name]
     scale = replace(scale, changes={**scale.changes, **shape, **reader}, learned={**scale.learned, **shape}, views=8)
-    scale = replace(scale, max_steps=1, max_curve_steps=1)
+    few = {"fine_tuning": replace(scale.fine_tuning, rays=16), "scratch": replace(scale.scratch, rays=16)}
+    scale = replace(scale, max_steps=1, max_curve_steps=1, **few)
 
     def train(trained, chosen, data, reference, folder):
         model = HyperPlanes(chosen.model)

@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 from small_demo import demo_folder
+from small_packaged import small_packaged
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.checkpoints import packaged_folder
@@ -198,12 +199,13 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     def make_runner(workspace, scale):
         return Runner(workspace, DataSets(workspace, scale, generate=None, device=cpu), train=None, device=cpu)
 
-    Demonstration(settings, tmp_path, make_runner, lambda: None, shown.append, None).show_packaged()
+    with small_packaged():
+        Demonstration(settings, tmp_path, make_runner, lambda: None, shown.append, None).show_packaged()
+        model = HyperPlanes.from_pretrained(packaged_folder("small"))
     assert (tmp_path / "first.html").exists()
     rows = [line.partition(":")[0] for line in shown]
     assert rows == ["nearest of 3 views, copied", "3 views", "the first page"]
     frames = sorted((tmp_path / "first/pictures/car/views_3/test0/orbit").iterdir())
-    model = HyperPlanes.from_pretrained(packaged_folder("small"))
     support = Shown(balls, 3, 2).task("test0").support
     found = to_pixels(model.adapt(support).render(orbit_cameras(support, 2)).images)
     read = np.stack([np.asarray(Image.open(frame).convert("RGB")) for frame in frames])

@@ -12,22 +12,34 @@ import pytest
 from hyperplanes.experiments.workers import Workers
 
 
-def workers(**methods):
-    """Two processes whose work has these methods."""
-    return Workers(2, partial(SimpleNamespace, data=SimpleNamespace(generated={}), **methods))
+@pytest.fixture(scope="module")
+def ended():
+    """What a process has answered that was sent SIGINT before it had imported anything, and the error of its pool.
+
+    It is killed in the end: SIGKILL, as a system that runs out of memory sends it.
+    """
+    methods = {"divide": partial(divmod, 7, 2), "end": partial(signal.raise_signal, signal.SIGKILL)}
+    pool = Workers(2, partial(SimpleNamespace, data=SimpleNamespace(generated={}), **methods))
+    answers = []
+
+    def work():
+        with pool:
+            answer = pool.submit({}, methodcaller("divide"))
+            for child in multiprocessing.active_children():
+                os.kill(child.pid, signal.SIGINT)
+            answers.append(answer.result())
+            pool.submit({}, methodcaller("end")).result()
+
+    with pytest.raises(ChildProcessError) as error:
+        work()
+    return answers, error
 
 
-def test_of_a_worker_that_is_killed_one_line_is_said():
-    """Source of truth: SIGKILL, as a system that runs out of memory sends it."""
-    pool = workers(end=partial(signal.raise_signal, signal.SIGKILL))
-    with pytest.raises(ChildProcessError, match="one was killed .*; give fewer --workers, and the same"), pool:
-        pool.submit({}, methodcaller("end")).result()
+def test_of_a_worker_that_is_killed_one_line_is_said(ended):
+    _, error = ended
+    assert error.match("one was killed .*; give fewer --workers, and the same")
 
 
-def test_ctrl_c_while_a_worker_starts_is_left_to_its_parent():
-    """Property: the process, which was sent SIGINT before it had imported anything, does its work."""
-    with workers(divide=partial(divmod, 7, 2)) as pool:
-        work = pool.submit({}, methodcaller("divide"))
-        for child in multiprocessing.active_children():
-            os.kill(child.pid, signal.SIGINT)
-        assert work.result() == (3, 1)
+def test_ctrl_c_while_a_worker_starts_is_left_to_its_parent(ended):
+    answers, _ = ended
+    assert answers == [(3, 1)]

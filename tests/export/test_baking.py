@@ -79,9 +79,9 @@ def test_baked_pictures_are_those_of_the_field(seen, baked):
 def test_the_compiled_caster_agrees_with_packed_torch(baked):
     # Source of truth: the same voxels as a callable through the generic renderer, at the same steps.
     scene = BakedScene(baked)
-    sampling = RayMarching(scene.steps, STOP)
-    generic = render(baked, CAMERAS, sampling, bounds=baked.occupancy.bounds, occupancy=baked.occupancy)
-    compiled = scene.render(CAMERAS)
+    sampling, cameras = RayMarching(scene.steps, STOP), camera.select(CAMERAS, [2, 5])
+    generic = render(baked, cameras, sampling, bounds=baked.occupancy.bounds, occupancy=baked.occupancy)
+    compiled = scene.render(cameras)
     assert float((generic.images - compiled.images).abs().max()) < 5e-3
     assert float((generic.images - compiled.images).abs().mean()) < 1e-4
 
@@ -274,19 +274,19 @@ def test_fitting_by_one_ray_a_pixel_makes_edges_soft(monkeypatch):
     ball = AdaptedField(
         lambda points, _: (points * 0, 500.0 * (points.norm(dim=-1) < 0.6)), full(Sphere(), 48), RayMarching(192)
     )
-    whole, found = bake(ball, side=64), []
+    whole, found = bake(ball, side=48), []
     shown, truth = (_means_of_areas(ball, count) for count in (10, 3))
     for edge in (voxel_fitting.EDGE, math.inf):
         monkeypatch.setattr(voxel_fitting, "EDGE", edge)
-        fitted = fit_voxels(whole, shown, steps=60, pixels=2048)
+        fitted = fit_voxels(whole, shown, steps=40, pixels=1024)
         found.append(float(psnr(BakedScene(fitted).render(truth.cameras).images, truth.images).mean()))
     assert found[0] > found[1] + 1
 
 
 def _means_of_areas(adapted, count):
-    """Pictures of 48x48, of 16 rays a pixel."""
-    cameras = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(count, 3.0), 48, 48)
-    fine = adapted.render(camera.resized(cameras, 192, 192), antialias=False).images
+    """Pictures of 32x32, of 16 rays a pixel."""
+    cameras = camera.pinhole(camera.symmetric_intrinsics(32, 32, 0.7), camera.fibonacci_sphere(count, 3.0), 32, 32)
+    fine = adapted.render(camera.resized(cameras, 128, 128), antialias=False).images
     return Views(avg_pool2d(fine, 4), cameras)
 
 

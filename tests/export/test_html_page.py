@@ -57,6 +57,11 @@ def baked():
 
 
 @pytest.fixture(scope="module")
+def coarse():
+    return bake(AdaptedField(two_balls, full(SPHERE, 32), RayMarching(96)), side=32)
+
+
+@pytest.fixture(scope="module")
 def small(views):
     """A part of a page that is quick to draw."""
     tiny = bake(AdaptedField(two_balls, full(SPHERE, 8), RayMarching(16)), side=8)
@@ -250,22 +255,22 @@ def test_a_camera_of_the_address_is_taken_when_it_is_typed_and_only_one_that_the
     assert told == ["turns"] * 6 + ["12x8"]
 
 
-def test_a_page_is_one_file_that_asks_for_nothing(baked, views, tmp_path):
-    picture = turning_picture(baked, views, frames=2, size=32)
-    text = save_page(page_of(baked, views, picture=picture), tmp_path / "page.html", "Two <balls>").read_text()
+def test_a_page_is_one_file_that_asks_for_nothing(coarse, views, tmp_path):
+    picture = turning_picture(coarse, views, frames=2, size=32)
+    text = save_page(page_of(coarse, views, picture=picture), tmp_path / "page.html", "Two <balls>").read_text()
     assert "<title>Two &lt;balls&gt;</title>" in text
     assert "data:image/webp;base64," in text
     assert not [word for word in ("http:", "https:", 'src="/', "import(", "fetch(") if word in text]
 
 
-def test_a_page_that_is_too_large_loses_precision_before_it_is_refused(baked, views, tmp_path):
+def test_a_page_that_is_too_large_loses_precision_before_it_is_refused(coarse, views, tmp_path):
     """All of the file counts: the picture, the viewer, and what stands around them with the longest title."""
-    picture = bytes(40_000)
-    whole = len(page_of(baked, views, picture=picture).encode())
+    picture = bytes(4000)
+    whole = len(page_of(coarse, views, picture=picture).encode())
     limit = whole - 1
-    smaller = page_of(baked, views, picture=picture, largest=limit)
+    smaller = page_of(coarse, views, picture=picture, largest=limit)
     assert len(smaller.encode()) <= limit
-    assert len(page_of(baked, views, picture=picture, largest=int(0.8 * whole))) < 0.8 * whole
+    assert len(page_of(coarse, views, picture=picture, largest=int(0.8 * whole))) < 0.8 * whole
     assert save_page(smaller, tmp_path / "page.html", 255 * '"').stat().st_size <= limit + AROUND
-    with pytest.raises(ValueError, match=r"page: expected at most 0.001 MB, got .* and a picture of 0.04 MB"):
-        page_of(baked, views, picture=picture, largest=1000)
+    with pytest.raises(ValueError, match=r"page: expected at most 0.001 MB, got .* and a picture of 0.004 MB"):
+        page_of(coarse, views, picture=picture, largest=1000)

@@ -47,13 +47,13 @@ def test_nothing_but_biases_of_reading_layers_is_shifted():
 def test_it_learns_what_tells_objects_apart(tmp_path):
     model = make(target="nerf")
     rates = {"learning_rate": 5e-3, "hypernetwork_learning_rate": 5e-3}  # at 1e-2, some seeds end in one constant field
-    config = TrainingConfig(steps=40, tasks=3, rays=64, evaluate_every=100, **rates)
+    config = TrainingConfig(steps=25, tasks=3, rays=64, evaluate_every=100, **rates)
     trainer = Trainer(model, Balls(), config, tmp_path)
-    losses = [trainer.take_step() for _ in range(40)]
+    losses = [trainer.take_step() for _ in range(25)]
     assert sum(losses[-5:]) < 0.6 * sum(losses[:5])
     data = Balls()
     one, other = (model.adapt(data.task(name).support).render(ring(1)).images for name in ("train0", "train2"))
-    assert (one - other).abs().max() > 0.1
+    assert (one - other)[..., 5:11, 5:11].mean().abs() > 0.03  # within both balls, whose outlines the hulls tell apart
     trainer.save()
     assert HyperPlanes.from_pretrained(tmp_path).config.method == "autoencoder"
 

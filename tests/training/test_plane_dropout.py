@@ -28,14 +28,16 @@ def qualities(model):
     """PSNR of views of held-out balls in dB: with all planes, the mean with each one hidden, and with each two."""
     tasks = [DATA.task(name) for name in ("test0", "test1")]
     contexts = [model.prepare(task.support) for task in tasks]
+    queries = [task.query[::2] for task in tasks]
+    rays = [query.rays_at(torch.arange(query.images[:, 0].numel()))[0] for query in queries]  # of all pixels
 
     @torch.no_grad()
     def quality(hidden):
         masked = [context.mask_views(torch.tensor(hidden, dtype=torch.long)) for context in contexts]
-        queries = [task.query[::2] for task in tasks]
         fields = [model.field(each, model.theta) for each in masked]
-        pictures = [field.render(query.cameras).images for field, query in zip(fields, queries, strict=True)]
-        return psnr(torch.cat(pictures), torch.cat([query.images for query in queries])).mean()
+        seen = [field.trace(each, differentiable=False).colour for field, each in zip(fields, rays, strict=True)]
+        truth = torch.cat([query.images for query in queries])
+        return psnr(torch.cat(seen).unflatten(0, (len(truth), *truth.shape[2:])).permute(0, 3, 1, 2), truth).mean()
 
     count = model.config.network.planes
     return [torch.stack(list(map(quality, combinations(range(count), hidden)))).mean() for hidden in range(3)]
@@ -43,9 +45,9 @@ def qualities(model):
 
 def test_a_field_trained_with_dropout_does_without_some_planes():
     (all_planes, one_hidden, two_hidden), without = qualities(trained(0.3)), qualities(trained(0.0))
-    assert all_planes > without[0] - 0.5  # measured: 0.3 dB better
+    assert all_planes > without[0] - 0.5  # measured: 0.2 dB better
     assert one_hidden > without[1] + 0.5  # measured: 1.0 dB
-    assert two_hidden > without[2] + 1.0  # measured: 1.7 dB
+    assert two_hidden > without[2] + 1.0  # measured: 1.8 dB
 
 
 @pytest.mark.parametrize("order", ["matched", "file"])

@@ -4,8 +4,6 @@ import os
 import subprocess
 import sys
 
-import pytest
-
 from hyperplanes.utilities.threads import DECIDED_BY
 
 CODE = "import os, {first}; print(os.environ.get('OMP_WAIT_POLICY'), 'torch' in __import__('sys').modules)"
@@ -27,6 +25,6 @@ def test_what_the_user_decided_stays():
     assert policy("hyperplanes", GOMP_SPINCOUNT="1000") == "None"
 
 
-@pytest.mark.parametrize("first", ["torch, hyperplanes"])
-def test_nothing_is_set_once_torch_is_loaded(first):
-    assert policy(first) == "None"
+def test_nothing_is_set_once_torch_is_loaded():
+    """A module of its name stands for PyTorch, which takes seconds to load."""
+    assert policy("sys; sys.modules['torch'] = sys; import hyperplanes") == "None"

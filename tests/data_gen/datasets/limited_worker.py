@@ -1,22 +1,20 @@
-"""The real worker, in a process that may not write more than a kilobyte into a file."""
+"""The real renderer of objects, while the process may not write more than a kilobyte into a file."""
 
 import resource
 import signal
+from contextlib import contextmanager
 
 from data_gen.datasets import objects
 
 
+@contextmanager
 def open_renderer(settings):
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    opened = objects.open_renderer(settings)
-
-    class Limited:
-        def __enter__(self):
-            process = opened.__enter__()
-            resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
-            return process
-
-        def __exit__(self, *details):
-            return opened.__exit__(*details)
-
-    return Limited()
+    with objects.open_renderer(settings) as process:
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1024, hard))
+        try:
+            yield process
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            signal.signal(signal.SIGXFSZ, ignored)

@@ -5,7 +5,6 @@ import json
 import math
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from importlib.metadata import version
@@ -117,8 +116,18 @@ def test_verify_finds_what_is_missing_and_what_has_changed(whole, tmp_path):
     assert (report.written, report.reused) == (5, 3), "what is missing or changed is made again"
 
 
-@pytest.mark.parametrize(("ending", "after"), [(signal.SIGKILL, 1), (signal.SIGINT, 2)])
-def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whole, tmp_path, ending, after):
+def goes_on(out, whole, reused):
+    """Generated again, what was left after so many objects becomes the whole data set."""
+    assert not (out / "manifest.json").exists(), "the end of the run was not awaited"
+    (out / ".progress/unfinished/.junk.part").write_bytes(b"half a file")
+    with rendered_here():
+        report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
+    assert report.written == 5
+    assert report.reused >= reused
+    assert tree(out) == tree(whole[0])
+
+
+def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whole, tmp_path):
     out = tmp_path / "cars"
     root = str(Path(objects.__file__).parents[2])
     process = subprocess.Popen(
@@ -127,23 +136,28 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whol
         stderr=subprocess.DEVNULL,
         env={**os.environ, "PYTHONPATH": root},
     )
-    for _ in range(after):
-        process.stdout.readline()
-    process.send_signal(ending)
+    process.stdout.readline()
+    process.kill()
     process.stdout.close()
     process.wait()
-    assert not (out / "manifest.json").exists(), "the end of the run was not awaited"
-    unfinished = out / ".progress/unfinished/.junk.part"
-    unfinished.write_bytes(b"half a file")
-    with rendered_here():
-        report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
-    assert report.written == 5
-    assert report.reused >= after
-    assert tree(out) == tree(whole[0])
+    goes_on(out, whole, 1)
+
+
+@pytest.mark.usefixtures("here")
+def test_interrupted_and_started_again_it_ends_with_the_same_bytes(whole, tmp_path):
+    """KeyboardInterrupt is what Python makes of Ctrl-C."""
+
+    def interrupt(done, *_):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generate(CARS, tmp_path / "cars", GenerationConfig(held_out=2, **SMALL), progress=interrupt)
+    goes_on(tmp_path / "cars", whole, 2)
 
 
 def test_the_number_of_workers_changes_nothing(whole, tmp_path):
-    generate(CARS, tmp_path / "cars", GenerationConfig(held_out=2, views=4, resolution=16, workers=2, recycle=2))
+    generate(CARS, tmp_path / "cars", GenerationConfig(held_out=2, views=4, resolution=16, workers=2, recycle=4))
     assert tree(tmp_path / "cars") == tree(whole[0])
 
 
@@ -237,10 +251,10 @@ def test_the_axis_is_that_of_the_format_unless_a_file_or_folder_is_named(tmp_pat
             axes(up_of=(wrong,))
 
 
+@pytest.mark.usefixtures("here")
 def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypatch):
-    """A worker whose files may not grow beyond 1 kB stands for a disk that is full."""
+    """A renderer whose files may not grow beyond 1 kB stands for a disk that is full."""
     monkeypatch.setattr("data_gen.datasets.generate.TARGET", "limited_worker:open_renderer")
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
     with pytest.raises(DataError, match=r"expected room to write \d+ bytes, found .*; ") as caught:
         generate(CARS, tmp_path / "out", GenerationConfig(held_out=2, views=4, resolution=64, workers=1))
     assert "\n" not in str(caught.value)

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from mesh_writers import OBJ_FACES, OBJ_SOLID, picture, write_obj
 
+from data_gen.meshes import model_folder
 from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts
-from data_gen.meshes.model_folder import MAX_REFERENCES
 from data_gen.meshes.mtl import MAX_LIBRARIES
 
 PAINT = "newmtl paint\nKd 1 0 0\n"
@@ -146,14 +146,15 @@ def test_vertices_of_lines_are_not_a_sign_of_a_cut_file(tmp_path):
     assert load_mesh(write_obj(tmp_path, body=body)).warnings == ("1 lines left out, only faces are drawn",)
 
 
-def test_a_mesh_that_would_take_minutes_is_refused_at_once(tmp_path):
+def test_a_mesh_that_would_take_minutes_is_refused_at_once(tmp_path, monkeypatch):
     body = OBJ_SOLID + OBJ_FACES
     libraries = "".join(f"mtllib {index}.mtl\n" for index in range(MAX_LIBRARIES + 1))
     with pytest.raises(MeshError, match=f"at most {MAX_LIBRARIES} material libraries, found {MAX_LIBRARIES + 1}"):
         load_mesh(write_obj(tmp_path, body=libraries + body))
     assert load_mesh(write_obj(tmp_path, body="mtllib gone.mtl\n" * 10**5 + body)).lost_files == ("gone.mtl",)
-    mtl = PAINT + "".join(f"newmtl m{index}\nmap_Kd {index}.png\n" for index in range(MAX_REFERENCES + 1))
-    with pytest.raises(MeshError, match=f"at most {MAX_REFERENCES} references"):
+    monkeypatch.setattr(model_folder, "MAX_REFERENCES", 50)
+    mtl = PAINT + "".join(f"newmtl m{index}\nmap_Kd {index}.png\n" for index in range(51))
+    with pytest.raises(MeshError, match="at most 50 references"):
         load_mesh(write_obj(tmp_path, mtl=mtl))
 
 

@@ -35,7 +35,7 @@ def pretend(fresh):
     return arrange
 
 
-def test_embree_works_in_a_real_subprocess(fresh):
+def test_embree_works_in_a_real_subprocess():
     outcome = renderers.probe("embree")
     assert outcome.works, outcome
     assert "Embree" in outcome.message

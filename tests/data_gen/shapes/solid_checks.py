@@ -1,12 +1,23 @@
-"""Slow, obvious geometry that the objects are compared with."""
+"""Slow, obvious geometry that the objects are compared with, and their hash; imports little, as processes need it."""
 
 from __future__ import annotations
+
+import hashlib
 
 import numpy as np
 
 from data_gen.shapes.parts import Part
 
 _TINY = 1e-12
+
+
+def digest(scene: object) -> str:
+    """The hash of vertices, faces, normals, texture coordinates and pixels of an object."""
+    arrays = []
+    for mesh in scene.geometry.values():
+        texture = np.asarray(mesh.visual.material.baseColorTexture)
+        arrays += [mesh.vertices, mesh.faces, mesh.vertex_normals, mesh.visual.uv, texture]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
 
 def _crossings(start: np.ndarray, end: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -1,0 +1,27 @@
+"""A packaged model of milliseconds, for tests of commands and pages that show any of them."""
+
+import tempfile
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.checkpoints import packaged_folder
+from hyperplanes.configuration.model import ModelConfig
+from hyperplanes.rendering import RayMarching
+from tests.reference_rendering import awaken
+
+
+@contextmanager
+def small_packaged():
+    """While this lasts, `small` has few weights, voxels and samples, and looks for no symmetry and no rotation."""
+    config = ModelConfig.load(packaged_folder("small"))
+    network = replace(config.network, depth=1, width=16, point_frequencies=1)
+    few = {"network": network, "hull_resolution": 16, "sampling": RayMarching(16)}
+    model = awaken(HyperPlanes(replace(config, **few, symmetric=False, azimuth=0.0)))
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        model.save(Path(folder) / "small")
+        patch.setattr("hyperplanes.adaptation.checkpoints.PACKAGED", Path(folder))
+        yield
