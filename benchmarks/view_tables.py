@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks.reporting import Row
+from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.utilities.tables import markdown_table
 
 __all__ = ["NAMES", "Result", "views", "views_over", "views_residuals", "views_summary", "views_tuned"]
@@ -99,11 +100,11 @@ def views_summary(*results: Result) -> str:
 
 
 def views_residuals(*results: Result) -> str:
-    """One forward pass of `small` without residual correction, and with it."""
+    """One forward pass of `small` without residual correction and with it, from as many views as it is made of."""
     found, counts = _of_views(results)
     lines = []
     for name, rows in found.items():
-        for count in (each for each in counts if ("uncorrected", each) in rows):
+        for count in (each for each in counts if each >= MANY_VIEWS and ("uncorrected", each) in rows):
             scores = [rows[method, count]["psnr"] for method in ("hull_blend", "uncorrected", "one_step")]
             over = _above(rows["one_step", count], "over_uncorrected")
             objects = rows["one_step", count]["objects"]
