@@ -124,7 +124,7 @@ def lamp():
 
 
 def coarse(name, *, side=48, symmetric=False, learned_steps=0):
-    """A packaged model with a hull of 48 voxels a side in place of 96: the same gaps in a fourth of the time.
+    """A packaged model with a hull of 48 voxels a side in place of 96: the same gaps in half the time.
 
     Where a test is not about reflections it looks for no symmetry, nor for a rotation: both take longer than to adapt.
     Where it is not about learned steps it takes none: what the forward pass alone brings, in two thirds of the time.

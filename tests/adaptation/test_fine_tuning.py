@@ -43,7 +43,7 @@ def support():
 
 
 @pytest.fixture
-def few_judge(monkeypatch):
+def few_held_out_rays(monkeypatch):
     """Held-out views are judged by fewer rays than users have."""
     monkeypatch.setattr(descent_module, "HOLDOUT_RAYS", 256)
 
@@ -288,7 +288,7 @@ def test_wrong_settings_are_refused(model, support):
         model.fine_tune(support[:2], "auto")
 
 
-@pytest.mark.usefixtures("few_judge")
+@pytest.mark.usefixtures("few_held_out_rays")
 def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, support):
     taken, tried = [], []
     ruinous = replace(WEIGHTS, learning_rate=1e30, muon_learning_rate=1e30, max_steps=12)  # NaN after the first step
@@ -299,7 +299,7 @@ def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, s
     assert torch.equal(field.render(cameras).images, model.adapt(support).render(cameras).images)
 
 
-@pytest.mark.usefixtures("few_judge")
+@pytest.mark.usefixtures("few_held_out_rays")
 def test_auto_goes_on_where_steps_show_left_out_views_better():
     model, support, taken, tried = awaken(small_model()), ball_views(ring(9)), [], []
     field = model.fine_tune(
@@ -370,7 +370,7 @@ def test_settings_that_cannot_be_are_refused(settings, message):
         FineTuning(**settings)
 
 
-@pytest.mark.usefixtures("few_judge")
+@pytest.mark.usefixtures("few_held_out_rays")
 def test_auto_tries_what_it_goes_on_with(monkeypatch):
     decided, made = [], fine_tuning.make_descent
 
@@ -388,7 +388,7 @@ def test_auto_tries_what_it_goes_on_with(monkeypatch):
         assert set(decided) == {(0.5, "contrast", 64 * (count >= 20)) if count >= 10 else (0.0, "uniform", 0)}
 
 
-@pytest.mark.usefixtures("few_judge")
+@pytest.mark.usefixtures("few_held_out_rays")
 def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
     model, support = awaken(small_model()), ball_views(ring(9))
     shown, holdout = split_holdout(support, WEIGHTS)

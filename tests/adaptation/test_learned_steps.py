@@ -159,14 +159,16 @@ def test_the_update_of_another_object_is_followed_by_steps_too():
 
 
 def test_training_makes_a_step_that_shows_query_views_better_and_leaves_the_model_alone(monkeypatch):
-    monkeypatch.setattr(training, "WARMUP", 1)
-    monkeypatch.setattr(training, "RAYS", 256)
-    monkeypatch.setattr(training, "MUON_RATE", 0.05)
     adapter, data = stepping(1), Balls(views=6)
-    config = TrainingConfig(steps=20, tasks=2, rays=64, views=(2, 3, 4), held_out=0)
+    config = TrainingConfig(steps=14, tasks=1, rays=64, views=(2, 3, 4), held_out=0)
     before, done = {name: value.clone() for name, value in adapter.state_dict().items()}, []
-    fitted = fit_learned_step(adapter, data, config, on_step=lambda step, loss: done.append(step))
-    assert done == list(range(1, 21))
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "WARMUP", 1)
+        patch.setattr(training, "STEPS", 2)
+        patch.setattr(training, "RAYS", 128)
+        patch.setattr(learned_steps, "PARTS", 1)
+        fitted = fit_learned_step(adapter, data, config, on_step=lambda step, loss: done.append(step))
+    assert done == list(range(1, 15))
     assert not any(value.requires_grad for value in fitted.parameters())
     assert all(torch.equal(value, before[name]) for name, value in adapter.state_dict().items())
     # on objects that it was not trained on
@@ -175,7 +177,7 @@ def test_training_makes_a_step_that_shows_query_views_better_and_leaves_the_mode
         adapter.learned_step, adapter.config = fitted, replace(adapter.config, learned_steps=steps)
         pictures = adapter.adapt(task.support[:3]).render(task.query.cameras).images
         errors.append(float((pictures - task.query.images).square().mean()))
-    assert errors[1] < errors[0] - 5e-5
+    assert errors[1] < errors[0] - 5e-5  # measured: 7e-5, and 7e-7 by a step that is not trained
 
 
 def test_training_goes_on_from_the_step_that_the_model_has(monkeypatch):

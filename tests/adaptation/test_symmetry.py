@@ -326,9 +326,8 @@ def test_of_a_symmetric_object_every_pixel_of_a_reflection_is_known():
 
 
 def test_the_hull_of_views_and_reflections_shows_sides_that_no_view_sees():
-    around = cameras(16, SMALL)
-    from_left = [index for index, direction in enumerate(around.extrinsics) if float(direction[2, 0]) > 0.3][:3]
-    others = balls(around, BODY)
+    others = balls(cameras(16, SMALL), BODY)
+    from_left = [index for index, each in enumerate(others.cameras.extrinsics) if float(each[2, 0]) > 0.3][:3]
     views = others[from_left]
     alone, both = (each.adapt(views).render(others.cameras).images for each in (HullBlend(), ReflectedHullBlend()))
     assert psnr(both, others.images).mean() > psnr(alone, others.images).mean() + 1
