@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.optim import Adam
 
 from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.learned_steps import step_inputs
 from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork, in_use
-from hyperplanes.adaptation.optimisers import make_optimisers
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.hypernetwork import LearnedStep
 from hyperplanes.parameters import Parameters
@@ -28,7 +28,7 @@ __all__ = ["fit_learned_step"]
 
 RAYS = 1024  # of the views shown, from which a gradient is found
 STEPS = 4  # the step that is trained is the first of an object, or follows one, two or three others
-RATE, MUON_RATE, WARMUP, LAST = 1e-3, 0.01, 100, 0.02  # rates at first, steps until then, and what they fall to
+RATE, WARMUP, LAST = 1e-3, 100, 0.02  # of Adam at first, steps until then, and what share of it remains in the end
 
 
 def fit_learned_step(
@@ -53,8 +53,7 @@ def fit_learned_step(
     if model.learned_step is not None:
         fitted.load_state_dict(model.learned_step.state_dict())
     fitted = fitted.to(model.rig).requires_grad_()
-    optimisers = make_optimisers(list(fitted.parameters()), "muon", RATE, MUON_RATE, betas=(0.9, 0.99))
-    rates = [each.param_groups[0]["lr"] for each in optimisers]
+    optimiser = Adam(fitted.parameters(), RATE, betas=(0.9, 0.99), fused=True)
     loader = EpisodeLoader(model, data, config, Processes.current())
     try:
         for step in range(config.steps):
@@ -63,9 +62,8 @@ def fit_learned_step(
                 loss = _gradients(model, fitted, loader.batch(step).rendered, config)
             share = (1 + math.cos(math.pi * step / config.steps)) / 2
             factor = min(1, (step + 1) / WARMUP) * (LAST + (1 - LAST) * share)
-            for optimiser, rate in zip(optimisers, rates, strict=True):
-                optimiser.param_groups[0]["lr"] = rate * factor
-                optimiser.step()
+            optimiser.param_groups[0]["lr"] = RATE * factor
+            optimiser.step()
             if on_step is not None:
                 on_step(step + 1, loss)
     finally:

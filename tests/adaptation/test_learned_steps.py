@@ -182,7 +182,6 @@ def test_training_makes_a_step_that_shows_query_views_better_and_leaves_the_mode
 
 def test_training_goes_on_from_the_step_that_the_model_has(monkeypatch):
     monkeypatch.setattr(training, "RATE", 0.0)
-    monkeypatch.setattr(training, "MUON_RATE", 0.0)
     adapter = stepping(1)
     config = TrainingConfig(steps=1, tasks=2, rays=64, views=(2, 3), held_out=0)
     fitted = fit_learned_step(adapter, Balls(views=6), config)

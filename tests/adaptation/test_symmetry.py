@@ -369,9 +369,9 @@ def test_adapting_shows_the_model_reflections_and_another_plane_or_none_can_be_g
     adapter = model()
     with torch.no_grad():
         adapter.theta["fine.density.bias"].fill_(1.0)
-    found = adapter.adapt(views).render(views.cameras).images
-    same = adapter.adapt_to(adapter.prepare(views, symmetry=ACROSS)).render(views.cameras).images
-    other = adapter.adapt_to(adapter.prepare(views)).render(views.cameras).images
+    found = adapter.adapt(views).render(cameras(1, SMALL)).images
+    same = adapter.adapt_to(adapter.prepare(views, symmetry=ACROSS)).render(cameras(1, SMALL)).images
+    other = adapter.adapt_to(adapter.prepare(views)).render(cameras(1, SMALL)).images
     assert torch.equal(found, same)
     assert not torch.allclose(found, other, atol=1e-3)
 
@@ -438,9 +438,9 @@ def test_the_field_of_an_object_keeps_the_plane_that_was_found():
     assert (alone.config.symmetric, alone.config.symmetry) == (False, ACROSS)
     again = type(alone.config).of_json(json.loads(json.dumps(alone.config.as_json())))
     assert again == alone.config
-    shown = views[:1]  # which tells no plane
-    assert alone.find_symmetry(shown) == ACROSS
-    assert torch.equal(alone.adapt(views).render(views.cameras).images, made.render(views.cameras).images)
+    assert alone.find_symmetry(views[:1]) == ACROSS  # a view that tells no plane
+    shown = cameras(1, SMALL)
+    assert torch.equal(alone.adapt(views).render(shown).images, made.render(shown).images)
 
 
 @pytest.mark.usefixtures("coarse")
