@@ -9,7 +9,7 @@ import pytest
 import torch
 from second_device import AVAILABLE, second_device
 
-from hyperplanes.adaptation import HyperPlanes, canonical_frame, symmetry
+from hyperplanes.adaptation import CorrectedField, HyperPlanes, canonical_frame, symmetry
 from hyperplanes.adaptation.canonical_frame import Placed
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.judging_symmetry import SymmetryJudge
@@ -101,6 +101,17 @@ def test_one_step_shows_the_same_picture():
     assert found.images.device.type != "cpu"
     assert float((found.images.cpu() - expected.images).square().mean()) < 1e-5
     assert float(expected.opacity.mean()) > 0.05
+
+
+def test_pictures_are_corrected_alike():
+    def shown(where):
+        task = car(where, shown=10)
+        field = small(where, learned_steps=0).adapt(task.support)
+        assert isinstance(field, CorrectedField)
+        return field.render(task.query.cameras, mixed_precision=False).images
+
+    found, expected = on_both(shown)
+    assert float((found.cpu() - expected).square().mean()) < 1e-5
 
 
 def test_gradient_steps_end_with_the_same_weights():

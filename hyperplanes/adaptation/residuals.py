@@ -41,7 +41,7 @@ DOUBT = 0.3  # weight of no residual at all
 FAINT, SOLID = 0.01, 1 / 3  # opacity of a pixel from which on it is corrected, and from which on wholly
 PAIRS = 1 << 18  # of a pixel and a support view, at once
 VIEWS = 8  # support views that are rendered together
-MOST_PIXELS = 1 << 21  # of support views, such as 52 of 200x200: larger ones take longer to render than to adapt to
+MOST_PIXELS = 1 << 21  # of support views, such as 52 of 200x200, which take 20 s of two cores
 
 _rendering = RLock()  # support views: two threads that need the same ones render them once
 
@@ -215,7 +215,7 @@ class CorrectedField(AdaptedField):
 
 
 def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support: Views) -> AdaptedField:
-    """A field whose pictures are corrected where the model is configured so, and where that is worth its time.
+    """A field whose pictures are corrected where the model is configured so, unless that would take long.
 
     Args:
         network: the model.
