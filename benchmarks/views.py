@@ -8,10 +8,10 @@ Of every held-out object some query views are kept back to be judged by; of all 
 are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
 (where there are masks), of views alone and with their reflections; the model without its hypernetwork, with the update
 of another object of the data set, with its own alone, averaged with the visual hull by one share an object, without
-reflections of views, without a canonical frame, without learned steps, with one ray a pixel, in single precision, with
-residual correction (of steps, too), and as it is used; and fine-tuned. Beside each mean stands how far it lies above
-`hull_blend`, steps above as many from random weights, and what is corrected above what is not, with the 95 % interval
-of that difference over the objects (paired, Student's t).
+reflections of views, without a canonical frame, without learned steps, with one ray a pixel, in single precision,
+without residual correction (of steps, too), and as it is used; and fine-tuned. Beside each mean stands how far it lies
+above `hull_blend`, steps above as many from random weights, and what is corrected above what is not, with the 95 %
+interval of that difference over the objects (paired, Student's t).
 
 With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
 Image are compared, has 251 views on a spiral, of which view 64, or views 64 and 128, are shown.

@@ -116,7 +116,6 @@ def adapt_to(
         ValueError: fine-tuning steps of a baked scene.
     """
     from hyperplanes.adaptation.kept import keep_field, kept_folder, recall_field
-    from hyperplanes.adaptation.residuals import CorrectedField
     from hyperplanes.adaptation.rotation import RotatedField
     from hyperplanes.adaptation.stacking import StackedField
     from hyperplanes.configuration.fine_tuning import FineTuning
@@ -163,7 +162,6 @@ def adapt_to(
         how += ", rotated into its canonical frame"
         rendered = rendered.unrotated
     how += ", averaged with hull_blend" if isinstance(rendered, StackedField) else ""
-    how += ", corrected by residuals" if isinstance(field, CorrectedField) else ""
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")
     return field, warned

@@ -142,7 +142,8 @@ def run(arguments: Arguments) -> int:
     if arguments.residuals == "on" and not isinstance(field, CorrectedField):
         field = ResidualField(field, shown)
     residuals = field.residuals if isinstance(field, CorrectedField) else field
-    if isinstance(residuals, ResidualField):
+    corrected = isinstance(residuals, ResidualField)
+    if corrected:
         with console.bar("residuals") as bar:
             residuals.prepare(lambda done: bar.show(done, len(shown), "shown views"))
     started = time.perf_counter()
@@ -164,7 +165,7 @@ def run(arguments: Arguments) -> int:
     if scores is None and not isinstance(source, BakedScene) and (arguments.steps == 0 or warned):
         scores = held_out_psnr(source, shown)
         if scores is not None:
-            without = " and residuals" if isinstance(residuals, ResidualField) else ""
+            without = " and residuals" if corrected else ""
             console.say(
                 f"without fine-tuning{without}, on support views left out for this: {scores[0]:.2f} dB PSNR, "
                 f"copying the nearest view {scores[1]:.2f} dB"
@@ -173,7 +174,8 @@ def run(arguments: Arguments) -> int:
     steps = None if isinstance(source, BakedScene) else arguments.steps
     for line in worse_than_copying(shown, *scores, steps) if scores else []:
         console.warn(f"{task.name}: {line}")
-    console.say(f"{arguments.out}: {len(paths)} pictures, {format_duration(seconds)} a view")
+    how = " corrected by residuals" if corrected else ""
+    console.say(f"{arguments.out}: {len(paths)} pictures{how}, {format_duration(seconds)} a view")
     return 0
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HullBlend, HyperPlanes
+from hyperplanes.adaptation import CorrectedField, HullBlend, HyperPlanes
 from hyperplanes.adaptation.descent import Descent
 from hyperplanes.adaptation.fine_tuning import fine_tune_to
 from hyperplanes.adaptation.gating import GatingNetwork, readings
@@ -97,20 +97,23 @@ def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
     torch.testing.assert_close(mixed, torch.lerp(one, other, 0.3))
 
 
-def test_view_shows_the_pictures_that_render_writes(tmp_path):
+@pytest.mark.parametrize("steps", [0, 1])
+def test_view_shows_the_pictures_that_render_writes_without_residuals(tmp_path, steps):
     class Viewer:
         def show(self, field, _):
             self.field = field
 
     adapter, support, cameras = (
-        HyperPlanes(replace(CONFIG, gated=True)),
+        HyperPlanes(replace(CONFIG, gated=True, residuals=True)).eval(),
         ball_views(ring(MANY_VIEWS, (24, 24))),
         ring(1),
     )
-    arguments, viewer = view.Arguments(tmp_path, steps=1, fit=0), Viewer()
+    arguments, viewer = view.Arguments(tmp_path, steps=steps, fit=0), Viewer()
     view._adapt(adapter, support, arguments, viewer, queue.SimpleQueue(), Console(silent=True))
-    expected = adapter.fine_tune(support, 1).render(cameras).images
-    torch.testing.assert_close(viewer.field.render(cameras).images, expected)
+    made = adapter.fine_tune(support, steps)
+    torch.testing.assert_close(viewer.field.render(cameras).images, made.without_residuals().render(cameras).images)
+    assert isinstance(made, CorrectedField)
+    assert not isinstance(viewer.field, CorrectedField)
 
 
 def test_view_takes_rays_as_render_does_and_shows_fields_that_stay_as_they_are(tmp_path, monkeypatch):
