@@ -239,6 +239,8 @@ class Descent:
         holdout: Views,
         *,
         unchanged: AdaptedField | None = None,
+        beside: AdaptedField | None = None,
+        share: float = 0.0,
         pixels: Int[Tensor, " pixel"] | None = None,
         on_step: Callable[[int], None] | None = None,
     ) -> int:
@@ -250,6 +252,8 @@ class Descent:
         Args:
             holdout: the views that decide.
             unchanged: the field of no step, where that is another one than the descent begins with.
+            beside: a field with which pictures are averaged, if any.
+            share: of that.
             pixels: flat indices of their pixels that count.
             on_step: called with the number of steps done, before the first and after each.
         """
@@ -259,6 +263,7 @@ class Descent:
         with torch.no_grad():
             near_far = self.field(None).sampling.near_far
             rays, truth = holdout.sample_rays(HOLDOUT_RAYS, generator=generator, among=pixels, near_far=near_far)
+            averaged = None if beside is None else beside.trace(rays, differentiable=False).colour
         errors: dict[int, float] = {}
         every = max(1, most // CHECKS)
 
@@ -271,7 +276,9 @@ class Descent:
                 continue
             field = unchanged if unchanged is not None and not step else self.field(None)
             with torch.no_grad():
-                error = float((field.trace(rays, differentiable=False).colour - truth).square().mean())
+                colour = field.trace(rays, differentiable=False).colour
+                colour = colour if averaged is None else colour.lerp(averaged, share)
+                error = float((colour - truth).square().mean())
             errors[step] = error if math.isfinite(error) else math.inf
             best = min(errors, key=lambda each: errors[each])
             if step - best > 2 * every:

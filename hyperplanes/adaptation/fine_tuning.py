@@ -22,7 +22,15 @@ from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 
-__all__ = ["NoProgressError", "fine_tune", "fine_tune_to", "made_anyway", "make_descent", "one_step"]
+__all__ = [
+    "NoProgressError",
+    "average_of",
+    "fine_tune",
+    "fine_tune_to",
+    "made_anyway",
+    "make_descent",
+    "one_step",
+]
 
 Made = TypeVar("Made")
 
@@ -88,11 +96,12 @@ def fine_tune(
     placed = to_canonical_frame(network, shown)
     holdout = placed.rotation.views(holdout)
     context = placed.context(network)
-    trial, _ = make_descent(network, context, settings, trained_on(context, placed.views))
+    trial, variables = make_descent(network, context, settings, trained_on(context, placed.views))
     pixels = network.live_pixels_of(context, holdout)
-    with torch.no_grad():
-        unchanged = network.field(context, updated_weights(network, context))
-    stop = trial.best_stop(holdout, unchanged=unchanged, pixels=pixels, on_step=on_trial)
+    unchanged = network.field(context, updated_weights(network, context))
+    before, share = average_of(network, context, settings, variables)
+    beside = None if before is None else network.field(context, before)
+    stop = trial.best_stop(holdout, unchanged=unchanged, beside=beside, share=share, pixels=pixels, on_step=on_trial)
 
     # as many steps on all of them, by the same schedule
     return _fine_tune_in_frame(network, support, stop, settings, settings.max_steps, on_step)
@@ -162,6 +171,7 @@ def fine_tune_to(
         with torch.no_grad():
             return stacked_field(network, context, updated_weights(network, context))
     descent, variables = make_descent(network, context, settings, views)
+    average = average_of(network, context, settings, variables)
     before, _ = descent.errors()
     for done in descent.run(steps if schedule is None else schedule):
         if on_step is not None:
@@ -170,7 +180,7 @@ def fine_tune_to(
             break
     after, empty = descent.errors()
     with torch.no_grad():
-        made = tuned_field(network, context, variables.weights())
+        made = tuned_field(network, context, variables.weights(), *average)
     if not after < max(before, empty * NEARLY):
         raise NoProgressError(
             f"fine-tuning: expected {steps} steps to lower the squared error, {before:.3g}, got {after:.3g}, where an "
@@ -178,6 +188,30 @@ def fine_tune_to(
             made if math.isfinite(after) else None,
         )
     return made
+
+
+def average_of(
+    network: HyperPlanesNetwork, context: SupportContext, settings: FineTuning, variables: Variables
+) -> tuple[Parameters | None, float]:
+    """The weights of the field that pictures after gradient steps are averaged with, and its share in them.
+
+    They are those that the steps begin with, or, where the model is what others made of one object, those before these.
+
+    Args:
+        network: the model.
+        context: the object.
+        settings: as in `fine_tune`.
+        variables: of `make_descent`, before the first step.
+
+    Returns:
+        None and 0 where pictures are those after the steps alone.
+    """
+    if network.theta_before is not None:
+        return network.theta_before, network.config.average
+    share = settings.average_share(len(context.given))
+    if not share or not network.reads_volume:
+        return None, 0.0
+    return Parameters((name, value.detach().clone()) for name, value in variables.weights().items()), share
 
 
 def make_descent(
@@ -219,8 +253,9 @@ def _variables(
         observed, theta = observe([context], network.hypernetwork.resolution), network.theta.detach()
         return Variables.of_hypernetwork(network.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
     if start is None:
-        start = _refreshed(network, network.adapted_weights(context), settings)  # without learned steps
-        start = network.finer(start, settings.cells or 0)
+        # weights that are partly random are so without learned steps
+        own = network.adapted_weights(context) if settings.fresh else updated_weights(network, context)
+        start = network.finer(_refreshed(network, own, settings), settings.cells or 0)
     return Variables.of_weights(start)
 
 

@@ -104,7 +104,8 @@ class HyperPlanes(HyperPlanesNetwork):
         themselves are optimised, or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes,
         section 3, fine-tuning). No step is the field of `adapt`. From 20 views on the weights' grid of features
         gets more cells (`settings.cells`). Where the model has a gating network, pictures from ten views on are
-        means with those of the visual hull (`stacking.tuned_field`). They are corrected as those of `adapt`.
+        means with those of the visual hull (`stacking.tuned_field`), from fewer with those of the field before the
+        steps (`settings.average`). They are corrected as those of `adapt`.
 
         Args:
             support: the views of the object.
@@ -142,7 +143,7 @@ class HyperPlanes(HyperPlanesNetwork):
         """
         adapted = adapted.without_residuals()
         learned = learned_part(adapted)
-        beside = {"hull_share": learned.share, "gated": learned.gate is not None}
+        beside = {"hull_share": learned.share, "gated": learned.gate is not None, "average": learned.average}
         azimuth = -adapted.rotation.angle if isinstance(adapted, RotatedField) else 0.0
         beside |= {"symmetric": False, "symmetry": adapted.symmetry, "azimuth": azimuth}
         found = {"fine": learned.field.field, "coarse": learned.field.proposal}
@@ -151,9 +152,13 @@ class HyperPlanes(HyperPlanesNetwork):
         if result.gate is not None and learned.gate is not None:
             result.gate.load_state_dict(learned.gate.state_dict())
         result.rig.copy_(self.rig)
-        for name, network in result.targets.items():
+        pairs = [(network, found[name]) for name, network in result.targets.items()]
+        if learned.before is not None:
+            earlier = {"fine": learned.before.field, "coarse": learned.before.proposal}
+            pairs += [(network, earlier[name]) for name, network in result.targets_before.items()]
+        for network, values in pairs:
             try:
-                network.load_state_dict(network.parameters_of(found[name]))
+                network.load_state_dict(network.parameters_of(values))
             except RuntimeError as error:
                 raise ValueError(f"adapted: expected a field of this model, got {adapted!r}") from error
         return result.eval()

@@ -59,6 +59,8 @@ class HyperPlanesNetwork(nn.Module):
                 shapes = {name: value.shape for name, value in self.networks.named_parameters()}
                 reading, volume = self.target.reading_layers, self.target.volume_size
                 self.hypernetwork = make_hypernetwork(shape, shapes, reading, volume)
+            self.targets_before = {name: make(config.network) for name in self.targets if config.average}
+            self.networks_before = nn.ModuleDict(self.targets_before)
             self.gate = GatingNetwork() if config.gated else None
             self.learned_step: LearnedStep | None = None
             if config.learned_steps:
@@ -70,6 +72,11 @@ class HyperPlanesNetwork(nn.Module):
     def theta(self) -> Parameters:
         """The universal weights, shared with the module."""
         return Parameters.of(self.networks)
+
+    @property
+    def theta_before(self) -> Parameters | None:
+        """The weights before the gradient steps that made theta, where `config.average` says so."""
+        return Parameters.of(self.networks_before) if self.networks_before else None
 
     @property
     def target(self) -> Target:

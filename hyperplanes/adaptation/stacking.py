@@ -29,8 +29,10 @@ from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.precision import without_autocast
 
 __all__ = [
+    "AveragedField",
     "Learned",
     "StackedField",
+    "average",
     "best_share",
     "hull_field",
     "hull_share",
@@ -123,6 +125,11 @@ class StackedField(AdaptedField):
         return self.gate.shares(own, other, self.share, self.views)
 
 
+@dataclass(frozen=True, repr=False)
+class AveragedField(StackedField):
+    """A field after gradient steps, whose pictures are means with those of the field before them (`average`)."""
+
+
 @dataclass(frozen=True)
 class Learned:
     """The part of a field that is a network.
@@ -131,11 +138,15 @@ class Learned:
         field: with what renders it.
         share: of the hull beside it, over all pixels.
         gate: what makes a share of every pixel of that, if anything does.
+        before: the field before gradient steps, if it is in the pictures.
+        average: its share.
     """
 
     field: AdaptedField
     share: float = 0.0
     gate: GatingNetwork | None = None
+    before: AdaptedField | None = None
+    average: float = 0.0
 
 
 def learned_part(adapted: AdaptedField) -> Learned:
@@ -148,6 +159,8 @@ def learned_part(adapted: AdaptedField) -> Learned:
         return learned_part(adapted.unrotated)
     if not isinstance(adapted, StackedField):
         return Learned(adapted)
+    if isinstance(adapted, AveragedField):
+        return Learned(adapted, before=adapted.other, average=adapted.share)
     if adapted.overruled:
         return Learned(adapted.other, 1 - adapted.share, adapted.gate)
     return Learned(adapted, adapted.share, adapted.gate)
@@ -187,6 +200,21 @@ def stack(
     return StackedField(**own, other=other, share=share, overruled=overruled, gate=gate, views=views)
 
 
+def average(tuned: AdaptedField, before: AdaptedField, share: float) -> AdaptedField:
+    """A field after gradient steps with the one before them as one: it has the mean of the pictures of both.
+
+    Steps on few views change what no view shows, too, partly for the worse. Their errors there are others than those
+    of the field before them, so that a mean has less of them (docs/adaptation.md).
+
+    Args:
+        tuned: the field after the steps, whose densities are those of the result.
+        before: the field before them.
+        share: of the latter.
+    """
+    own = {each.name: getattr(tuned, each.name) for each in fields(tuned)}
+    return AveragedField(**own, other=before, share=share)
+
+
 @torch.no_grad()
 def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
     """The field of given weights, stacked with the visual hull where the model is configured so.
@@ -201,6 +229,8 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
         weights: of the field.
     """
     learned = network.rendering_field(context, weights)
+    if network.theta_before is not None:
+        return average(learned, network.rendering_field(context, network.theta_before), network.config.average)
     if context.views.masks is None:
         return learned
     share = network.config.hull_share
@@ -214,19 +244,29 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
 
 
 @torch.no_grad()
-def tuned_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
-    """The field of weights after gradient steps, stacked with the visual hull by the model's gating network.
+def tuned_field(
+    network: HyperPlanesNetwork,
+    context: SupportContext,
+    weights: Parameters,
+    before: Parameters | None = None,
+    share: float = 0.0,
+) -> AdaptedField:
+    """The field of weights after gradient steps, averaged with the one before them or with the visual hull.
 
-    It is the field alone where there is no such network, and with fewer than MANY_VIEWS given views, their reflections
-    not counted. The network makes a share of every pixel, as where held-out views give the hull none. No view is held
-    out: gradient steps learn from all of them.
+    The hull is mixed in by the model's gating network, where it has one, with MANY_VIEWS given views or more, their
+    reflections not counted. The network makes a share of every pixel, as where held-out views give the hull none. No
+    view is held out: gradient steps learn from all of them.
 
     Args:
         network: the model.
         context: the object.
         weights: of the field.
+        before: the weights before the steps, where their field is in the pictures.
+        share: of that.
     """
     tuned = network.rendering_field(context, weights)
+    if before is not None:
+        return average(tuned, network.rendering_field(context, before), share)
     if network.gate is None or context.views.masks is None or len(context.given) < MANY_VIEWS:
         return tuned
     return stack(tuned, hull_field(context), 0.0, network.gate, len(context.views))

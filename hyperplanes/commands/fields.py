@@ -117,7 +117,7 @@ def adapt_to(
     """
     from hyperplanes.adaptation.kept import keep_field, kept_folder, recall_field
     from hyperplanes.adaptation.rotation import RotatedField
-    from hyperplanes.adaptation.stacking import StackedField
+    from hyperplanes.adaptation.stacking import AveragedField, StackedField
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.evaluation.suitability import suitability_warnings
     from hyperplanes.export.baking import BakedScene
@@ -161,7 +161,9 @@ def adapt_to(
     if isinstance(rendered, RotatedField):
         how += ", rotated into its canonical frame"
         rendered = rendered.unrotated
-    how += ", averaged with hull_blend" if isinstance(rendered, StackedField) else ""
+    if isinstance(rendered, StackedField):
+        beside = "the field before them" if isinstance(rendered, AveragedField) else "hull_blend"
+        how += f", averaged with {beside}"
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")
     return field, warned

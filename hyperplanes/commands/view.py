@@ -173,7 +173,7 @@ def _adapt(
 
     from hyperplanes.adaptation.canonical_frame import to_canonical_frame
     from hyperplanes.adaptation.context import trained_on
-    from hyperplanes.adaptation.fine_tuning import make_descent
+    from hyperplanes.adaptation.fine_tuning import average_of, make_descent
     from hyperplanes.adaptation.stacking import tuned_field
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene, default_side
@@ -183,13 +183,13 @@ def _adapt(
     placed, steps = to_canonical_frame(model, shown), arguments.steps if len(shown) > 1 else 0
     context = placed.context(model)
     descent, variables = make_descent(model, context, FineTuning(), trained_on(context, placed.views))
-    field = None
+    field, average = None, average_of(model, context, FineTuning(), variables)
     for done in descent.run(steps):
         if done % EVERY == 0 or done == steps:
             with torch.no_grad():
                 weights = Parameters((name, value.clone()) for name, value in variables.weights().items())
             field = placed.in_scene(
-                tuned_field(model, context, weights) if steps else model.adapt_to(context).without_residuals()
+                tuned_field(model, context, weights, *average) if steps else model.adapt_to(context).without_residuals()
             )
             viewer.show(field, f"{len(shown)} support views, {done} of {steps} fine-tuning steps")
         _check(wanted)

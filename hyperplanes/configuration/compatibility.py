@@ -37,7 +37,7 @@ def check_model(config: ModelConfig) -> type[Target]:
         )
     if config.plane_dropout and (target.permutation_invariant or not target.reads_planes):
         raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
-    for name in ("stacked", "hull_share", "gated", "symmetric", "symmetry", "azimuth"):
+    for name in ("stacked", "hull_share", "gated", "average", "symmetric", "symmetry", "azimuth"):
         if getattr(config, name) and not target.permutation_invariant:
             raise ValueError(f"{name}: expected a field that takes any number of views, got {config.target}")
     return target
@@ -84,8 +84,8 @@ def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: Mo
         target: its network.
 
     Raises:
-        ValueError: the hypernetwork of a model that has none, a negative number of steps, or steps on a single view by
-            a field that would learn to copy it.
+        ValueError: the hypernetwork of a model that has none, a negative number of steps, steps on a single view by a
+            field that would learn to copy it, or pictures averaged with those of partly random weights.
     """
     if settings.trainable == "hypernetwork" and config.hypernetwork is None and config.autoencoder is None:
         raise ValueError("fine_tune: expected a model with a hypernetwork, got one without")
@@ -99,6 +99,10 @@ def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: Mo
         raise ValueError(
             f"steps: expected 0 with a single view, whose colours {config.target} would learn to copy, got "
             f"{steps}; give 2 views or more"
+        )
+    if settings.average and (fresh := settings.fresh_share(views)) and config.hypernetwork is not None:
+        raise ValueError(
+            f"average: expected 0 with first weights that are partly random (fresh {fresh:g}), got {settings.average:g}"
         )
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from hyperplanes.utilities.arguments import checked_fields
 
-__all__ = ["CELLS", "FINE_VIEWS", "FRESH", "MANY_VIEWS", "RATES", "FineTuning", "Steps"]
+__all__ = ["AVERAGE", "CELLS", "FINE_VIEWS", "FRESH", "MANY_VIEWS", "RATES", "FineTuning", "Steps"]
 
 Steps: TypeAlias = int | Literal["auto"]
 
@@ -23,6 +23,10 @@ docs/adaptation.md."""
 
 FRESH = 0.5
 """Share of random weights that fine-tuning a field with a grid of features begins with; docs/small-training.md."""
+
+AVERAGE = 1.5
+"""Over the number of support views, of which there are few: the share of the field before the steps in pictures after
+them; docs/adaptation.md."""
 
 CELLS, FINE_VIEWS = 64, 20
 """Cells an axis of the grid of features that fine-tuning optimises with so many support views or more; hypernetworks
@@ -62,6 +66,9 @@ class FineTuning:
         cells: an axis of the grid of features that the steps optimise, where the weights of a field with one are
             trained: those that they begin with are interpolated to so many. Fewer than it has change nothing. Where
             None, CELLS for a field that takes any number of views, with FINE_VIEWS or more of them, else 0.
+        average: share, in pictures, of the field that the steps begin with, where a hypernetwork writes a grid of
+            features, the weights are trained, and none of the first ones is random. Where None, AVERAGE over the
+            number of views with fewer than MANY_VIEWS, else 0.
         draw: the pixels of rays: all with the same probability ("uniform"), or those more often around which colours
             differ ("contrast"), which count less in the loss by as much. Where None, "contrast" for the weights of a
             field that takes any number of views, with MANY_VIEWS or more of them, else "uniform", as in the paper.
@@ -85,6 +92,7 @@ class FineTuning:
     seed: int = 0
     draw: Literal["uniform", "contrast"] | None = None
     cells: Annotated[int, range(257)] | None = None
+    average: float | None = None
 
     def __post_init__(self) -> None:
         for name, least in (("rays", 1), ("max_steps", 1), ("holdout", 2)):
@@ -95,15 +103,24 @@ class FineTuning:
             if rate is not None and not 0 <= rate < math.inf:
                 raise ValueError(f"{name}: expected a finite number of 0 or more, got {rate}")
 
-        if self.fresh is not None and not 0 <= self.fresh <= 1:
-            raise ValueError(f"fresh: expected a share from 0 to 1, got {self.fresh}")
+        for name in ("fresh", "average"):
+            share = getattr(self, name)
+            if share is not None and not 0 <= share <= 1:
+                raise ValueError(f"{name}: expected a share from 0 to 1, got {share}")
 
     def fresh_share(self, views: int) -> float:
         """How much of the first weights is random, with so many support views."""
         return (FRESH if views >= MANY_VIEWS else 0.0) if self.fresh is None else self.fresh
 
+    def average_share(self, views: int) -> float:
+        """The share, in pictures, of the field that the steps begin with, with so many support views."""
+        if self.trainable != "weights" or self.fresh_share(views):
+            return 0.0
+        few = AVERAGE / max(2, views) if views < MANY_VIEWS else 0.0
+        return few if self.average is None else self.average
+
     def for_views(self, views: int, any_number: bool) -> FineTuning:
-        """The settings with what so many support views have for `fresh`, `draw` and `cells`, where they state none.
+        """The settings with what so many views have where they leave `fresh`, `draw`, `cells` or `average` open.
 
         Args:
             views: how many there are.
@@ -113,7 +130,8 @@ class FineTuning:
         draw = self.draw or ("contrast" if many else "uniform")
         finer = CELLS if many and views >= FINE_VIEWS else 0
         cells = finer if self.cells is None else self.cells
-        return replace(self, fresh=self.fresh_share(views), draw=draw, cells=cells)
+        shares = {"fresh": self.fresh_share(views), "average": self.average_share(views)}
+        return replace(self, draw=draw, cells=cells, **shares)
 
     def with_rates(self, rates: Mapping[str, float]) -> FineTuning:
         """The settings with these rates where they state none; `rates` are fields of the settings by name."""

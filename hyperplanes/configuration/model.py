@@ -55,6 +55,8 @@ class ModelConfig:
         hull_share: of `hull_blend` in the pictures of a model that is not `stacked`: what was decided for one object.
         gated: a gating network makes a share of every pixel of that one (`adaptation.gating`); `training.gating` trains
             it after the model. With ten given views or more it also mixes the hull into pictures after gradient steps.
+        average: share of a field of other weights in the pictures of a model: of those before gradient steps, where the
+            model is what these made of one object (`stacking.average`).
         learned_steps: steps of gradient descent that a network takes after the forward pass
             (`adaptation.learned_steps`), half as many from twenty views on; `training.learned_step` trains it after the
             model.
@@ -80,6 +82,7 @@ class ModelConfig:
     stacked: bool = False
     hull_share: float = 0.0
     gated: bool = False
+    average: float = 0.0
     learned_steps: Annotated[int, range(33)] = 0
     residuals: bool = False
     symmetric: bool = False
@@ -89,8 +92,9 @@ class ModelConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.plane_dropout < 1:
             raise ValueError(f"plane_dropout: expected a probability from 0 to below 1, got {self.plane_dropout}")
-        if not 0 <= self.hull_share <= 1:
-            raise ValueError(f"hull_share: expected a share from 0 to 1, got {self.hull_share}")
+        for name in ("hull_share", "average"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
         if self.azimuth is not None and not math.isfinite(self.azimuth):
             raise ValueError(f"azimuth: expected a finite angle in radians, got {self.azimuth}")
         if self.stacked and self.hull_share:
@@ -118,9 +122,9 @@ class ModelConfig:
         return replace(self, target=name, network=network)
 
     def target_alone(self) -> ModelConfig:
-        """The model without what finds weights for its target, and without the visual hull beside its pictures."""
+        """The model without what finds weights for its target, and without another field in its pictures."""
         alone = replace(self, hypernetwork=None, autoencoder=None, initialisation=None)
-        return replace(alone, stacked=False, hull_share=0.0, gated=False, learned_steps=0)
+        return replace(alone, stacked=False, hull_share=0.0, gated=False, average=0.0, learned_steps=0)
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""
