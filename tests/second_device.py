@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
-from torch.utils._pytree import tree_map
 
 __all__ = ["AVAILABLE", "NAME", "register", "second_device"]
 
@@ -28,6 +27,7 @@ _ATEN = torch.ops.aten
 _MOVING = {_ATEN._to_copy.default, _ATEN.copy_.default}
 _INDEXING = {_ATEN.index.Tensor, _ATEN.index_put_.default, _ATEN.index_put.default, _ATEN._index_put_impl_.default}
 """Indices may lie on the CPU."""
+_WITHOUT_OPERATOR = {Tensor.new_tensor, Tensor.tolist, Tensor.numpy}
 
 
 @contextmanager
@@ -75,20 +75,16 @@ class _Functions(TorchFunctionMode):
     """Those that PyTorch computes without asking an operator."""
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        kwargs = dict(kwargs or {})
+        kwargs = kwargs or {}
         if function in (torch.tensor, torch.as_tensor) and _is_second(kwargs.get("device")):
-            device = kwargs.pop("device")
-            return function(*args, **kwargs).to(device)
-        first = args[0] if args and isinstance(args[0], _Remote) else None
-        if first is None:
+            return function(*args, **{**kwargs, "device": None}).to(kwargs["device"])
+        if function not in _WITHOUT_OPERATOR or not isinstance(args[0], _Remote):
             return function(*args, **kwargs)
         if function is Tensor.new_tensor:
-            return torch.tensor(args[1], dtype=kwargs.get("dtype", first.dtype)).to(first.device)
+            return torch.tensor(args[1], dtype=kwargs.get("dtype", args[0].dtype)).to(args[0].device)
         if function is Tensor.tolist:
-            return first.detach().cpu().tolist()
-        if function is Tensor.numpy:
-            raise TypeError(f"can't convert a tensor on {NAME} to numpy; use .cpu() first")
-        return function(*args, **kwargs)
+            return args[0].detach().cpu().tolist()
+        raise TypeError(f"can't convert a tensor on {NAME} to numpy; use .cpu() first")
 
 
 def _computed(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
@@ -113,8 +109,20 @@ def _computed(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any
     found = operator(*held_args, **held_kwargs)
     if not (_is_second(asked) if asked is not None else remote):
         return found
-    found = tree_map(lambda value: _Remote(value) if isinstance(value, Tensor) else value, found)
-    return return_and_correct_aliasing(operator, args, kwargs, found) if remote else found
+    found = _moved(found)
+    return return_and_correct_aliasing(operator, args, kwargs, found) if remote and _aliases(operator) else found
+
+
+@cache
+def _aliases(operator: Any) -> bool:
+    """Whether a result is one of the arguments, or a view of it."""
+    return any(each.alias_info is not None for each in operator._schema.returns)
+
+
+def _moved(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return type(value)(_moved(each) for each in value)
+    return _Remote(value) if isinstance(value, Tensor) else value
 
 
 def _held(value: Any) -> Any:

@@ -15,12 +15,16 @@ from tests.reference_rendering import awaken
 
 
 @contextmanager
-def small_packaged():
-    """While this lasts, `small` has few weights, voxels and samples, and looks for no symmetry and no rotation."""
+def small_packaged(**changes):
+    """While this lasts, `small` has few weights, voxels and samples, and looks for no symmetry and no rotation.
+
+    Args:
+        changes: of its configuration, further ones.
+    """
     config = ModelConfig.load(packaged_folder("small"))
     network = replace(config.network, depth=1, width=16, point_frequencies=1)
     few = {"network": network, "hull_resolution": 16, "sampling": RayMarching(16)}
-    model = awaken(HyperPlanes(replace(config, **few, symmetric=False, azimuth=0.0)))
+    model = awaken(HyperPlanes(replace(config, **few, symmetric=False, azimuth=0.0, **changes)))
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         model.save(Path(folder) / "small")
         patch.setattr("hyperplanes.adaptation.checkpoints.PACKAGED", Path(folder))

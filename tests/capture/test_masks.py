@@ -87,8 +87,8 @@ def test_the_network_finds_what_stands_out():
 @pytest.fixture
 def coarse(monkeypatch):
     """Hulls of fewer voxels."""
-    monkeypatch.setattr(consistency, "COARSE", 60)
-    monkeypatch.setattr(consistency, "FINE", 100)
+    monkeypatch.setattr(consistency, "COARSE", 48)
+    monkeypatch.setattr(consistency, "FINE", 96)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import WithSupport
 from hyperplanes.evaluation import evaluate
-from hyperplanes.experiments import EXPERIMENTS, SCALES
+from hyperplanes.experiments import EXPERIMENTS, SCALES, estimate
 from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.experiments.engine import Runner
 from hyperplanes.experiments.workspace import Workspace
@@ -40,7 +40,7 @@ def out(tmp_path_factory):
 def cars(out):
     """The data set that `reproduce` generates where none is given."""
     with rendered_here():
-        assert main(["reproduce", "time", "--scale", "smoke", "--out", str(out)]) == 0
+        assert main(["reproduce", "time", "--scale", "smoke", "--only", "HyperPlanes-0", "--out", str(out)]) == 0
     (folder,) = (out / "data").glob("car-*")
     return folder
 
@@ -63,6 +63,12 @@ def reproduced(out, given):
         return Reproduced(shown.getvalue(), files, json.loads(files["results.json"]))
 
     return run
+
+
+@pytest.fixture
+def without_figures(monkeypatch):
+    """The figure of each experiment is drawn once, by `reproduced`."""
+    monkeypatch.setattr("hyperplanes.utilities.plots.encode_figure", lambda figure, kind: b"")
 
 
 @dataclass(frozen=True)
@@ -96,6 +102,7 @@ def test_every_experiment_runs(name, reproduced):
     assert experiment.where in text
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_nothing_is_made_twice_and_what_is_missing_is_made_again(out, given, reproduced, capsys):
     table = reproduced("target").files["table.csv"]
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
@@ -172,6 +179,7 @@ def test_every_row_of_an_ablation_is_another_model(reproduced):
         assert len(found) == len(cells), name
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_what_the_paper_has_of_other_sources_reaches_trainings_and_evaluations(out, cars, tmp_path, monkeypatch):
     published = tmp_path / "car-learnit"
     splits = {split: list(open_dataset(cars).names(split)) for split in ("train", "test")}
@@ -228,6 +236,7 @@ def test_fields_are_sampled_as_their_models_are_trained(name, tmp_path, monkeypa
             assert field.sampling == runner.trainings.configuration(experiment, trained, 0).model.sampling, cell
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_seeds_are_of_trainings(out, given):
     command = ["reproduce", "time", "--scale", "smoke", "--seeds", "2", "--out", str(out), *given]
     assert main(command) == 0
@@ -237,7 +246,9 @@ def test_seeds_are_of_trainings(out, given):
     assert len(list((out / "trainings").glob("car-*-hyperplanes-1-*"))) == 1
 
 
-def test_an_estimate_counts_every_seed(out, given, capsys):
+def test_an_estimate_counts_every_seed(out, given, monkeypatch, capsys):
+    monkeypatch.setattr(estimate, "STEPS", 1)
+    monkeypatch.setattr(estimate, "SIDE", 8)
     command = ["reproduce", "shapenet", "--scale", "smoke", "--estimate", "--out", str(out), *given]
     assert main([*command, "--seeds", "3"]) == 0
     shown = capsys.readouterr().out

@@ -50,6 +50,23 @@ def seen(adapted):
     return adapted.render(CAMERAS)
 
 
+@pytest.fixture(scope="module")
+def coarse(adapted):
+    return bake(adapted, side=32)
+
+
+@pytest.fixture(scope="module")
+def other_views(adapted):
+    """Pictures of the field from elsewhere."""
+    cameras = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
+    return Views(adapted.render(cameras).images, cameras)
+
+
+def quality_of(field, views):
+    """PSNR of the pictures of baked voxels in dB."""
+    return float(psnr(BakedScene(field).render(views.cameras).images, views.images).mean())
+
+
 def test_harmonics_are_orthonormal():
     # Source of truth: the integral over the sphere, by an even spread of directions.
     directions = camera.fibonacci_sphere(20_000, 1.0)[:, 2, :3]
@@ -243,29 +260,23 @@ def test_what_lies_outside_the_sphere_is_not_baked():
     assert found.centres().norm(dim=1).max() < 1 + 2 * 2 / 32
 
 
-def test_fitting_brings_back_colours_and_densities(adapted, seen):
+def test_fitting_brings_back_colours_and_densities(coarse, seen, other_views):
     # Source of truth: the field's own pictures, of cameras that are not fitted to.
-    whole, shown = bake(adapted, side=32), seen.images
-    faded = replace(whole, values=0.9 * whole.values)
-    others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
-    truth, steps = adapted.render(others).images, []
-    fitted = fit_voxels(faded, Views(shown, CAMERAS), steps=30, pixels=1024, on_step=steps.append)
-    before, after = (float(psnr(BakedScene(each).render(others).images, truth).mean()) for each in (faded, fitted))
-    assert after > before + 5
+    faded, steps = replace(coarse, values=0.9 * coarse.values), []
+    fitted = fit_voxels(faded, Views(seen.images, CAMERAS), steps=30, pixels=1024, on_step=steps.append)
+    assert quality_of(fitted, other_views) > quality_of(faded, other_views) + 5
     assert steps == list(range(1, 31))
-    assert torch.equal(fitted.index, whole.index)
+    assert torch.equal(fitted.index, coarse.index)
 
 
-def test_fitting_begins_with_voxels_that_rays_pass_through(adapted, seen, monkeypatch):
+def test_fitting_begins_with_voxels_that_rays_pass_through(coarse, seen, other_views, monkeypatch):
     """Voxels of a ball that is too large: without the bound of depths, what is opaque hides what is behind it."""
-    whole = bake(adapted, side=32)
-    opaque = replace(whole, values=torch.cat([whole.values[:, :1].clamp_min(300.0), whole.values[:, 1:]], 1))
-    others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
-    truth, found = adapted.render(others).images, []
+    opaque = replace(coarse, values=torch.cat([coarse.values[:, :1].clamp_min(300.0), coarse.values[:, 1:]], 1))
+    found = []
     for bound in (voxel_fitting.LARGEST_DEPTH, math.inf):
         monkeypatch.setattr(voxel_fitting, "LARGEST_DEPTH", bound)
         fitted = fit_voxels(opaque, Views(seen.images, CAMERAS), steps=30, pixels=1024)
-        found.append(float(psnr(BakedScene(fitted).render(others).images, truth).mean()))
+        found.append(quality_of(fitted, other_views))
     assert found[0] > found[1] + 1
 
 
@@ -275,34 +286,30 @@ def test_fitting_by_one_ray_a_pixel_makes_edges_soft(monkeypatch):
         lambda points, _: (points * 0, 500.0 * (points.norm(dim=-1) < 0.6)), full(Sphere(), 48), RayMarching(192)
     )
     whole, found = bake(ball, side=48), []
-    shown, truth = (_means_of_areas(ball, count) for count in (10, 3))
+    shown, truth = (_means_of_areas(ball, count) for count in (6, 2))
     for edge in (voxel_fitting.EDGE, math.inf):
         monkeypatch.setattr(voxel_fitting, "EDGE", edge)
         fitted = fit_voxels(whole, shown, steps=40, pixels=1024)
-        found.append(float(psnr(BakedScene(fitted).render(truth.cameras).images, truth.images).mean()))
+        found.append(quality_of(fitted, truth))
     assert found[0] > found[1] + 1
 
 
 def _means_of_areas(adapted, count):
-    """Pictures of 32x32, of 16 rays a pixel."""
-    cameras = camera.pinhole(camera.symmetric_intrinsics(32, 32, 0.7), camera.fibonacci_sphere(count, 3.0), 32, 32)
-    fine = adapted.render(camera.resized(cameras, 128, 128), antialias=False).images
+    """Pictures of 24x24, of 16 rays a pixel."""
+    cameras = camera.pinhole(camera.symmetric_intrinsics(24, 24, 0.7), camera.fibonacci_sphere(count, 3.0), 24, 24)
+    fine = adapted.render(camera.resized(cameras, 96, 96), antialias=False).images
     return Views(avg_pool2d(fine, 4), cameras)
 
 
-def test_a_guide_keeps_what_few_views_do_not_show(adapted, seen):
+def test_a_guide_keeps_what_few_views_do_not_show(adapted, coarse, seen, other_views):
     """Two views of another brightness: without the guide all that they do not show is lost, with it little."""
-    whole, guide = bake(adapted, side=32), render_guide(adapted, Views(seen.images, CAMERAS)[:2])
+    guide = render_guide(adapted, Views(seen.images, CAMERAS)[:2])
     assert guide is not None
     assert guide.size == (CAMERAS.height[0] // 2, CAMERAS.width[0] // 2)
     darker = Views(0.8 * seen.images, CAMERAS)[:2]
-    others = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
-    truth = adapted.render(others).images
-    alone, guided = (fit_voxels(whole, darker, guide=each, steps=30, pixels=1024) for each in (None, guide))
-    lost = [float(psnr(BakedScene(each).render(others).images, truth).mean()) for each in (alone, guided)]
-    assert lost[1] > lost[0] + 3
-    many = Views(truth.repeat(6, 1, 1, 1), camera.select(others, [0, 1, 2] * 6))
-    assert render_guide(adapted, many) is None
+    alone, guided = (fit_voxels(coarse, darker, guide=each, steps=30, pixels=1024) for each in (None, guide))
+    assert quality_of(guided, other_views) > quality_of(alone, other_views) + 3
+    assert render_guide(adapted, other_views[[0, 1, 2] * 6]) is None
 
 
 def test_the_guide_of_splats_is_of_their_voxels_in_the_size_of_the_views(adapted, seen, baked):
