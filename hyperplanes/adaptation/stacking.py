@@ -70,7 +70,7 @@ class StackedField(AdaptedField):
     views: int = field(default=FEWEST, kw_only=True)
 
     def __repr__(self) -> str:
-        return f"StackedField({super().__repr__()}, {self.share:.0%} of {self.other!r})"
+        return f"{type(self).__name__}({super().__repr__()}, {self.share:.0%} of {self.other!r})"
 
     def with_sampling(self, sampling: Sampler) -> AdaptedField:
         """As `AdaptedField.with_sampling`, of the learned field; the visual hull keeps its own."""

@@ -11,7 +11,7 @@ from hyperplanes.adaptation.descent import Descent
 from hyperplanes.adaptation.fine_tuning import fine_tune_to
 from hyperplanes.adaptation.gating import GatingNetwork, readings
 from hyperplanes.adaptation.held_out import FEWEST
-from hyperplanes.adaptation.stacking import StackedField, stack
+from hyperplanes.adaptation.stacking import AveragedField, StackedField, stack
 from hyperplanes.commands import view
 from hyperplanes.commands.console import Console
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
@@ -84,35 +84,37 @@ def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
     for count in (MANY_VIEWS - 1, MANY_VIEWS):
         support = ball_views(ring(count, (24, 24)))
         tuned = adapter.fine_tune(support, 1, settings)
-        assert isinstance(tuned, StackedField) == (count == MANY_VIEWS)
-        assert not isinstance(adapter.fine_tune(replace(support, masks=None), 1, settings), StackedField)
+        unmasked = adapter.fine_tune(replace(support, masks=None), 1, settings)
+        assert [isinstance(each, AveragedField) for each in (tuned, unmasked)] == [count < MANY_VIEWS] * 2
+        assert isinstance(tuned, StackedField)
+        assert isinstance(unmasked, StackedField) == (count < MANY_VIEWS)
     assert (tuned.share, tuned.views) == (0, MANY_VIEWS)
     again = adapter.with_weights_of(tuned).adapt(support)
     torch.testing.assert_close(again.render(cameras).images, tuned.render(cameras).images, atol=1e-6, rtol=0)
     few = adapter.prepare(ball_views(ring(MANY_VIEWS - 1, (24, 24))), symmetry=Symmetry(Plane((1.0, 0.0, 0.0))))
     assert len(few.views) > MANY_VIEWS
-    assert not isinstance(fine_tune_to(adapter, few, 1, settings), StackedField)  # reflections do not count
+    assert isinstance(fine_tune_to(adapter, few, 1, settings), AveragedField)  # reflections do not count
     alone, hull = replace(tuned, gate=None), HullBlend().adapt_to(adapter.prepare(support).planes)
     one, other, mixed = (each.render(cameras).images for each in (alone, hull, tuned))
     torch.testing.assert_close(mixed, torch.lerp(one, other, 0.3))
 
 
-@pytest.mark.parametrize("steps", [0, 1])
-def test_view_shows_the_pictures_that_render_writes_without_residuals(tmp_path, steps):
+@pytest.mark.parametrize(("steps", "count"), [(0, MANY_VIEWS), (1, MANY_VIEWS), (1, 3)])
+def test_view_shows_the_pictures_that_render_writes_without_residuals(tmp_path, steps, count):
     class Viewer:
         def show(self, field, _):
             self.field = field
 
     adapter, support, cameras = (
         HyperPlanes(replace(CONFIG, gated=True, residuals=True)).eval(),
-        ball_views(ring(MANY_VIEWS, (24, 24))),
+        ball_views(ring(count, (24, 24))),
         ring(1),
     )
     arguments, viewer = view.Arguments(tmp_path, steps=steps, fit=0), Viewer()
     view._adapt(adapter, support, arguments, viewer, queue.SimpleQueue(), Console(silent=True))
     made = adapter.fine_tune(support, steps)
     torch.testing.assert_close(viewer.field.render(cameras).images, made.without_residuals().render(cameras).images)
-    assert isinstance(made, CorrectedField)
+    assert isinstance(made, CorrectedField) == (count == MANY_VIEWS)
     assert not isinstance(viewer.field, CorrectedField)
 
 
