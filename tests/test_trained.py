@@ -304,6 +304,19 @@ def _changed(find, change, *inputs, **options):
     return change(find(*inputs, **options))
 
 
+def test_few_gradient_steps_on_few_views_do_no_harm_where_they_begin_after_the_learned_ones(monkeypatch):
+    """22.2 dB before ten of them and 21.8 after; from the weights of the forward pass, of 17.9, they end at 18.3.
+
+    Both by a fourth of the rays that users have; by all of them the first end at 22.7, before which there are 22.5.
+    """
+    monkeypatch.setattr(learned_steps, "RAYS", 512)
+    task, settings = shape(), FineTuning(rays=256)
+    begun, plain = (coarse("small", learned_steps=steps) for steps in (4, 0))
+    found = [quality(model.fine_tune(few(task, 3), 10, settings), task) for model in (begun, plain)]
+    assert found[0] > mean_psnr(begun, task, 3) - 1
+    assert found[0] > found[1] + 2
+
+
 @cache
 def reflected(kind, count):
     """The field of so many views and of the reflections that the model finds."""
