@@ -62,6 +62,7 @@ class _SceneReader:
         self._counts: dict[str | None, int] = {}
         self._plain = [self._geometries(mesh, index) for index, mesh in enumerate(document.items("meshes"))]
         self._parts = 0
+        self._in_world = {_WORLD: np.eye(4)}  # transforms of frames
 
     def read(self) -> trimesh.Scene:
         """All nodes of the scene, each under its parent."""
@@ -69,6 +70,7 @@ class _SceneReader:
         for frame_from, index, matrix in self._edges():
             node = self._nodes[index]
             self._scene.graph.update(frame_to=index, frame_from=frame_from, matrix=matrix)
+            self._in_world[index] = self._in_world[frame_from] @ matrix
             if "mesh" in node:
                 drawn.append(node | {"index": index})
         for node in drawn:
@@ -144,8 +146,7 @@ class _SceneReader:
                 )
 
     def _skinning(self, skin: dict[str, Any]) -> Skinning:
-        joints = [self._scene.graph.get(not_negative(joint), _WORLD)[0] for joint in skin["joints"]]
-        matrices = np.stack(joints)
+        matrices = np.stack([self._in_world[not_negative(joint)] for joint in skin["joints"]])
         if "inverseBindMatrices" in skin:
             inverse = read_numbers(self._document, skin["inverseBindMatrices"]).reshape(-1, 4, 4)
             matrices = matrices @ inverse[: len(matrices)].transpose(0, 2, 1)
