@@ -68,7 +68,7 @@ class FineTuning:
             None, CELLS for a field that takes any number of views, with FINE_VIEWS or more of them, else 0.
         average: share, in pictures, of the field that the steps begin with, where a hypernetwork writes a grid of
             features, the weights are trained, and none of the first ones is random. Where None, AVERAGE over the
-            number of views with fewer than MANY_VIEWS, else 0.
+            number of views, at most a half, with fewer than MANY_VIEWS, else 0.
         draw: the pixels of rays: all with the same probability ("uniform"), or those more often around which colours
             differ ("contrast"), which count less in the loss by as much. Where None, "contrast" for the weights of a
             field that takes any number of views, with MANY_VIEWS or more of them, else "uniform", as in the paper.
@@ -116,7 +116,7 @@ class FineTuning:
         """The share, in pictures, of the field that the steps begin with, with so many support views."""
         if self.trainable != "weights" or self.fresh_share(views):
             return 0.0
-        few = AVERAGE / max(2, views) if views < MANY_VIEWS else 0.0
+        few = AVERAGE / max(3, views) if views < MANY_VIEWS else 0.0
         return few if self.average is None else self.average
 
     def for_views(self, views: int, any_number: bool) -> FineTuning:

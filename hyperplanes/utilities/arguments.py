@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import sys
 import types
 from collections.abc import Callable
 from functools import cache, wraps
 from numbers import Integral, Real
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
-
-import torch
-from torch import Tensor
 
 __all__ = ["checked", "checked_fields", "kind_of", "mismatch"]
 
@@ -84,7 +82,7 @@ def mismatch(value: object, hint: Any) -> str | None:
     return None if _fits(value, hint) else f"expected {_shown(hint)}, got {kind_of(value)}"
 
 
-def kind_of(value: object) -> str:
+def kind_of(value: Any) -> str:
     """What a value is, for a message.
 
     >>> kind_of(None), kind_of([1]), kind_of((1.5, [2]))
@@ -92,7 +90,7 @@ def kind_of(value: object) -> str:
     """
     if isinstance(value, tuple) and value:
         return f"a tuple of {', '.join([*map(kind_of, value[:4]), *(['...'] if len(value) > 4 else [])])}"
-    if isinstance(value, Tensor):
+    if _is_tensor(value):
         return f"a tensor of {str(value.dtype).removeprefix('torch.')}, shape {tuple(value.shape)}"
     if value is None or isinstance(value, bool | int | float | str):
         return repr(value)[:60]
@@ -135,12 +133,24 @@ def _is_checkable(hint: Any) -> bool:
 
 
 def _fits(value: object, hint: Any) -> bool:
-    if isinstance(value, str) and torch.device in _in_any_order(hint):
+    if isinstance(value, str) and _takes_devices(hint):
         return _is_device(value)
     return any(_fits_one(value, part) for part in _in_any_order(hint))
 
 
+def _is_tensor(value: object) -> bool:
+    torch = sys.modules.get("torch")  # loading it takes two seconds, and where nobody did, there is no tensor
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def _takes_devices(hint: Any) -> bool:
+    torch = sys.modules.get("torch")
+    return torch is not None and torch.device in _in_any_order(hint)
+
+
 def _is_device(name: str) -> bool:
+    import torch
+
     try:
         torch.device(name)
     except RuntimeError:
@@ -148,7 +158,7 @@ def _is_device(name: str) -> bool:
     return True
 
 
-def _fits_one(value: object, hint: Any) -> bool:
+def _fits_one(value: Any, hint: Any) -> bool:
     if _is_array(hint):
         if not isinstance(value, hint.array_type):
             return False
@@ -161,7 +171,7 @@ def _fits_one(value: object, hint: Any) -> bool:
     if hint is float:
         number = isinstance(value, Real) and not isinstance(value, bool)
         number = number and (not isinstance(value, Integral) or abs(int(value)) < 2**63)
-        return number or (isinstance(value, Tensor) and value.numel() == 1)
+        return number or (_is_tensor(value) and value.numel() == 1)
     if hint is int:
         return (
             isinstance(value, Integral) and not isinstance(value, bool) and abs(int(value)) < 2**63
@@ -198,7 +208,7 @@ def _has_shape(shape: tuple[int, ...], dimensions: tuple[Any, ...]) -> bool:
 
 
 def _shown(hint: Any) -> str:
-    if torch.device in _parts(hint):
+    if _takes_devices(hint):
         return "a device such as 'cpu' or 'cuda:0'"
     return " or ".join(_shown_one(part) for part in _parts(hint))
 
