@@ -8,7 +8,22 @@ import types
 from collections.abc import Callable
 from functools import cache, wraps
 from numbers import Integral, Real
-from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeGuard,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 __all__ = ["checked", "checked_fields", "kind_of", "mismatch"]
 
@@ -82,7 +97,7 @@ def mismatch(value: object, hint: Any) -> str | None:
     return None if _fits(value, hint) else f"expected {_shown(hint)}, got {kind_of(value)}"
 
 
-def kind_of(value: Any) -> str:
+def kind_of(value: object) -> str:
     """What a value is, for a message.
 
     >>> kind_of(None), kind_of([1]), kind_of((1.5, [2]))
@@ -138,7 +153,7 @@ def _fits(value: object, hint: Any) -> bool:
     return any(_fits_one(value, part) for part in _in_any_order(hint))
 
 
-def _is_tensor(value: object) -> bool:
+def _is_tensor(value: object) -> TypeGuard[Tensor]:
     torch = sys.modules.get("torch")  # loading it takes two seconds, and where nobody did, there is no tensor
     return torch is not None and isinstance(value, torch.Tensor)
 
@@ -158,7 +173,7 @@ def _is_device(name: str) -> bool:
     return True
 
 
-def _fits_one(value: Any, hint: Any) -> bool:
+def _fits_one(value: object, hint: Any) -> bool:
     if _is_array(hint):
         if not isinstance(value, hint.array_type):
             return False

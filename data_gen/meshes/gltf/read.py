@@ -62,7 +62,7 @@ class _SceneReader:
         self._counts: dict[str | None, int] = {}
         self._plain = [self._geometries(mesh, index) for index, mesh in enumerate(document.items("meshes"))]
         self._parts = 0
-        self._in_world = {_WORLD: np.eye(4)}  # transforms of frames
+        self._in_world: dict[Any, npt.NDArray[np.float64]] = {_WORLD: np.eye(4)}  # transforms of frames
 
     def read(self) -> trimesh.Scene:
         """All nodes of the scene, each under its parent."""
