@@ -162,7 +162,7 @@ def adapt_to(
         how += ", rotated into its canonical frame"
         rendered = rendered.unrotated
     if isinstance(rendered, StackedField):
-        beside = "the field before them" if isinstance(rendered, AveragedField) else "hull_blend"
+        beside = "the field before gradient steps" if isinstance(rendered, AveragedField) else "hull_blend"
         how += f", averaged with {beside}"
     seconds = format_duration(time.perf_counter() - started)
     console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")

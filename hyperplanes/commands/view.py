@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import queue
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -36,7 +36,8 @@ from hyperplanes.utilities.interrupts import Terminated
 if TYPE_CHECKING:
     import torch
 
-    from hyperplanes.adaptation.base import Adapter
+    from hyperplanes.adaptation.base import AdaptedField, Adapter
+    from hyperplanes.adaptation.context import SupportContext
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.export.live import LiveViewer
     from hyperplanes.views import Views
@@ -160,6 +161,31 @@ def _show_others(
             viewer.show_other(name, None, f"{name}: {error}")
 
 
+def _fields(
+    model: HyperPlanes, context: SupportContext, views: Views, steps: int
+) -> Iterator[tuple[int, AdaptedField | None]]:
+    """Numbers of steps done, each with the field after them where that is to be shown."""
+    import torch
+
+    from hyperplanes.adaptation.fine_tuning import average_of, make_descent
+    from hyperplanes.adaptation.stacking import tuned_field
+    from hyperplanes.configuration.fine_tuning import FineTuning
+    from hyperplanes.parameters import Parameters
+
+    if not steps:
+        yield 0, model.adapt_to(context).without_residuals()
+        return
+    descent, variables = make_descent(model, context, FineTuning(), views)
+    average = average_of(model, context, FineTuning(), variables)
+    for done in descent.run(steps):
+        if done % EVERY and done != steps:
+            yield done, None
+            continue
+        with torch.no_grad():
+            weights = Parameters((name, value.clone()) for name, value in variables.weights().items())
+        yield done, tuned_field(model, context, weights, *average)
+
+
 def _adapt(
     model: HyperPlanes,
     shown: Views,
@@ -169,28 +195,16 @@ def _adapt(
     console: Console,
 ) -> None:
     """Shows the field as it is adapted, fine-tuned and baked."""
-    import torch
-
     from hyperplanes.adaptation.canonical_frame import to_canonical_frame
     from hyperplanes.adaptation.context import trained_on
-    from hyperplanes.adaptation.fine_tuning import average_of, make_descent
-    from hyperplanes.adaptation.stacking import tuned_field
-    from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.export.baking import BakedScene, default_side
-    from hyperplanes.parameters import Parameters
 
     console.say(f"adapting to {len(shown)} views")
     placed, steps = to_canonical_frame(model, shown), arguments.steps if len(shown) > 1 else 0
-    context = placed.context(model)
-    descent, variables = make_descent(model, context, FineTuning(), trained_on(context, placed.views))
-    field, average = None, average_of(model, context, FineTuning(), variables)
-    for done in descent.run(steps):
-        if done % EVERY == 0 or done == steps:
-            with torch.no_grad():
-                weights = Parameters((name, value.clone()) for name, value in variables.weights().items())
-            field = placed.in_scene(
-                tuned_field(model, context, weights, *average) if steps else model.adapt_to(context).without_residuals()
-            )
+    context, field = placed.context(model), None
+    for done, made in _fields(model, context, trained_on(context, placed.views), steps):
+        if made is not None:
+            field = placed.in_scene(made)
             viewer.show(field, f"{len(shown)} support views, {done} of {steps} fine-tuning steps")
         _check(wanted)
     if arguments.fit and field is not None:

@@ -278,15 +278,18 @@ def test_morph_targets_count_with_their_default_weights(tmp_path, where):
 
 
 def test_skinned_vertices_go_with_their_joints_and_not_with_their_node(tmp_path):
-    header, buffer = gltf(nodes=[{"mesh": 0, "skin": 0, "translation": [9, 9, 9]}, {"translation": [0, 3, 0]}])
+    above = {"translation": [0, 3, 0], "scale": [2, 2, 2], "children": [2]}
+    skinned = {"mesh": 0, "skin": 0, "translation": [9, 9, 9]}
+    header, buffer = gltf(nodes=[skinned, above, {"translation": [1, 0, 0]}])
+    header["scenes"][0]["nodes"] = [0, 1]
     joints, buffer = add(header, buffer, np.zeros((4, 4), np.uint8), "VEC4", 5121)
     weights, buffer = add(header, buffer, np.array([[255, 0, 0, 0]] * 4, np.uint8), "VEC4", 5121, normalized=True)
     header["meshes"][0]["primitives"][0]["attributes"].update(JOINTS_0=joints, WEIGHTS_0=weights)
-    header["skins"] = [{"joints": [1]}]
+    header["skins"] = [{"joints": [2]}]
     (tmp_path / "a.glb").write_bytes(glb_bytes(header, buffer))
     mesh = load_mesh(tmp_path / "a.glb")
     assert mesh.warnings == ()
-    assert np.allclose(points_in_file(mesh), TETRAHEDRON + [0, 3, 0], atol=1e-6)
+    assert np.allclose(points_in_file(mesh), 2 * (TETRAHEDRON + [1, 0, 0]) + [0, 3, 0], atol=1e-6)
 
 
 def test_quantised_positions_are_scaled_by_their_largest_number(tmp_path):
