@@ -112,7 +112,10 @@ class Balls:
         return self.splits.get(split, [])
 
     def task(self, name: str) -> Task:
-        number = int(name[-1]) + (5 if name.startswith("test") else 0)
+        return self.ball(int(name[-1]) + (5 if name.startswith("test") else 0), name)
+
+    def ball(self, number: float, name: str) -> Task:
+        """A ball whose colour and size are those of this number, 0 to 8."""
         colour = (0.15 + 0.1 * number, 0.9 - 0.1 * number, 0.3)
         radius = 0.4 + 0.04 * number
         support = ball_views(ring(self.views, self.size), colour=colour, radius=radius)

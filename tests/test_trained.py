@@ -46,10 +46,14 @@ LAST_LAYERS = ImageHyperNetworkConfig(**{**SMALL, "normalisation": "batch"})
 
 
 class ManyBalls(Balls):
-    """Eight balls to train on; the held-out ones have colours and sizes between theirs."""
+    """Nine balls to train on; the held-out ones, far apart, have colours and sizes between theirs."""
 
     def __init__(self):
-        super().__init__(train=8, test=3, views=4)
+        super().__init__(train=9, test=3, views=4)
+
+    def task(self, name):
+        place = int(name[-1])
+        return self.ball((0.5, 3.5, 7.5)[place] if name.startswith("test") else place, name)
 
 
 @cache
@@ -57,7 +61,7 @@ def trained(shape):
     """A field that reads no image, so that all it knows of an object is the update; some seconds of training."""
     network = TargetConfig(depth=2, width=24, planes=1, point_frequencies=2, direction_frequencies=1)
     model = small_model(target="nerf", network=network, hypernetwork=shape)
-    config = TrainingConfig(steps=80, tasks=2, rays=24, learning_rate=1e-2, hypernetwork_learning_rate=3e-3)
+    config = TrainingConfig(steps=40, tasks=4, rays=48, learning_rate=1e-2, hypernetwork_learning_rate=3e-3)
     trainer = Trainer(model, ManyBalls(), replace(config, held_out=0))
     while trainer.step < config.steps:
         trainer.take_step()
@@ -75,8 +79,8 @@ def figures(model, data=None, names=("test0", "test1", "test2")):
 @pytest.mark.parametrize("shape", [ALL_LAYERS, LAST_LAYERS])
 def test_the_update_depends_on_the_object_and_swapping_it_costs_decibels(shape):
     spread, gap = figures(trained(shape).model)
-    assert spread > 0.1
-    assert gap > 0.5
+    assert spread > 0.2
+    assert gap > 1
 
 
 @pytest.mark.parametrize("shape", [ALL_LAYERS, LAST_LAYERS])
