@@ -103,9 +103,10 @@ class HyperPlanes(HyperPlanesNetwork):
         It begins at theta + delta, of which `settings.fresh` is replaced by random weights. Either these weights
         themselves are optimised, or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes,
         section 3, fine-tuning). No step is the field of `adapt`. From 20 views on the weights' grid of features
-        gets more cells (`settings.cells`). Where the model has a gating network, pictures from ten views on are
-        means with those of the visual hull (`stacking.tuned_field`), from fewer with those of the field before the
-        steps (`settings.average`). They are corrected as those of `adapt`.
+        gets more cells (`settings.cells`). Pictures are corrected as those of `adapt`; where they are not, from ten
+        views on and by a model with a gating network, they are means with those of the visual hull
+        (`stacking.tuned_field`). From fewer views they are means with those of the field before the steps
+        (`settings.average`).
 
         Args:
             support: the views of the object.

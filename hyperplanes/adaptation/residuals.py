@@ -32,7 +32,7 @@ from hyperplanes.utilities.memory import require_memory
 from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views
 
-__all__ = ["CorrectedField", "ResidualField", "corrected_field"]
+__all__ = ["CorrectedField", "ResidualField", "are_corrected", "corrected_field"]
 
 SHARPNESS = 10.0  # of weights over 1 - the cosine of the angle between rays: a third at 27 degrees
 WIDEST = 0.5  # of that, from which on the weight is 0: 60 degrees
@@ -214,8 +214,20 @@ class CorrectedField(AdaptedField):
         return self.residuals.correct(pictures, cameras)
 
 
+def are_corrected(network: HyperPlanesNetwork, support: Views) -> bool:
+    """Whether pictures of what a model makes of an object are corrected: the model says so, and it does not take long.
+
+    Args:
+        network: the model.
+        support: the views of the object: MANY_VIEWS with masks or more, which have MOST_PIXELS at most.
+    """
+    height, width = support.size
+    enough = len(support) >= MANY_VIEWS and support.masks is not None
+    return network.config.residuals and enough and len(support) * height * width <= MOST_PIXELS
+
+
 def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support: Views) -> AdaptedField:
-    """A field whose pictures are corrected where the model is configured so, unless that would take long.
+    """A field whose pictures are corrected where they are to be (`are_corrected`).
 
     Args:
         network: the model.
@@ -223,11 +235,9 @@ def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support:
         support: the views of the object.
 
     Returns:
-        A `CorrectedField` of MANY_VIEWS with masks or more, which have MOST_PIXELS at most; else the field.
+        A `CorrectedField`, or the field.
     """
-    height, width = support.size
-    few = len(support) < MANY_VIEWS or support.masks is None
-    if few or not network.config.residuals or len(support) * height * width > MOST_PIXELS:
+    if not are_corrected(network, support):
         return adapted
     own = {each.name: getattr(adapted, each.name) for each in fields(AdaptedField)}
     return CorrectedField(**own, uncorrected=adapted, residuals=ResidualField(adapted, network.to_own(support)))

@@ -17,6 +17,7 @@ from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.held_out import FEWEST, Trial, hold_out
 from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
+from hyperplanes.adaptation.residuals import are_corrected
 from hyperplanes.adaptation.rotation import RotatedField
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry.kernels.threads import at_once
@@ -255,7 +256,8 @@ def tuned_field(
 
     The hull is mixed in by the model's gating network, where it has one, with MANY_VIEWS given views or more, their
     reflections not counted. The network makes a share of every pixel, as where held-out views give the hull none. No
-    view is held out: gradient steps learn from all of them.
+    view is held out: gradient steps learn from all of them. Where pictures are corrected (`residuals.are_corrected`)
+    there is no hull in them: it brings nothing beside that (docs/image-based-measurements.md), and takes time.
 
     Args:
         network: the model.
@@ -267,7 +269,8 @@ def tuned_field(
     tuned = network.rendering_field(context, weights)
     if before is not None:
         return average(tuned, network.rendering_field(context, before), share)
-    if network.gate is None or context.views.masks is None or len(context.given) < MANY_VIEWS:
+    few = context.views.masks is None or len(context.given) < MANY_VIEWS
+    if network.gate is None or few or are_corrected(network, context.given):
         return tuned
     return stack(tuned, hull_field(context), 0.0, network.gate, len(context.views))
 

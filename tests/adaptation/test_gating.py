@@ -91,6 +91,11 @@ def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
     assert (tuned.share, tuned.views) == (0, MANY_VIEWS)
     again = adapter.with_weights_of(tuned).adapt(support)
     torch.testing.assert_close(again.render(cameras).images, tuned.render(cameras).images, atol=1e-6, rtol=0)
+    adapter.config = replace(adapter.config, residuals=True)
+    corrected = adapter.fine_tune(support, 1, settings)
+    assert not isinstance(corrected.without_residuals(), StackedField)  # pictures that are corrected need no hull
+    assert not adapter.with_weights_of(corrected).config.gated
+    adapter.config = replace(adapter.config, residuals=False)
     few = adapter.prepare(ball_views(ring(MANY_VIEWS - 1, (24, 24))), symmetry=Symmetry(Plane((1.0, 0.0, 0.0))))
     assert len(few.views) > MANY_VIEWS
     assert isinstance(fine_tune_to(adapter, few, 1, settings), AveragedField)  # reflections do not count
