@@ -16,14 +16,14 @@ FIRST_SEED = 900_000
 
 
 def held_out(
-    count: int, size: int, views: int = 50, device: torch.device | str = "cpu", kind: str = "car"
+    count: int, size: int, views: int = 50, device: torch.device | str = "cpu", kind: str = "car", *, first: int = 0
 ) -> list[Task]:
     """Procedural objects never trained on, half of the views support and half query, on the fixed rig."""
     rig = fixed(views, size)
     cameras = rig.cameras(dtype=torch.float32)
     tasks = []
     with MeshRenderer() as renderer:
-        for seed in range(FIRST_SEED, FIRST_SEED + count):
+        for seed in range(FIRST_SEED + first, FIRST_SEED + first + count):
             mesh = prepare_scene(make(kind, seed), f"{kind}-{seed}")
             pixels = torch.tensor(renderer.render(mesh_parts(mesh), rig).rgba).permute(0, 3, 1, 2)
             pixels = pixels.contiguous().float() / 255  # as what is read from files

@@ -3,20 +3,21 @@
 import copy
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import pytest
 import torch
 from second_device import AVAILABLE, second_device
 
-from hyperplanes.adaptation import CorrectedField, HyperPlanes, canonical_frame, symmetry
+from hyperplanes.adaptation import CorrectedField, HyperPlanes, canonical_frame, held_out, reflections, symmetry
 from hyperplanes.adaptation.canonical_frame import Placed
 from hyperplanes.adaptation.hull_blend import HullBlend
-from hyperplanes.adaptation.judging_symmetry import SymmetryJudge
+from hyperplanes.adaptation.judging_symmetry import SymmetryJudge, carved
 from hyperplanes.adaptation.reflections import with_reflections
 from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.symmetry import Fold
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.presets import preset
 from hyperplanes.data import read_task
 from hyperplanes.export.baking import bake
@@ -104,8 +105,9 @@ def test_one_step_shows_the_same_picture():
     assert float(expected.opacity.mean()) > 0.05
 
 
-def test_pictures_are_corrected_alike():
+def test_pictures_are_corrected_alike(monkeypatch):
     """Those of a mean with the hull, by the share and the gate that held-out views decide."""
+    monkeypatch.setattr(held_out, "PIXELS", 128)
 
     def shown(where):
         task = car(where, shown=10)
@@ -119,9 +121,12 @@ def test_pictures_are_corrected_alike():
 
 
 def test_gradient_steps_end_with_the_same_weights():
+    settings = FineTuning(rays=64)
+
     def tuned(where):
         task = car(where)
-        return small(where, learned_steps=1).fine_tune(task.support, 2).render(task.query.cameras, **PLAIN).images
+        field = small(where, learned_steps=1).fine_tune(task.support, 2, settings)
+        return field.render(task.query.cameras, **PLAIN).images
 
     found, expected = on_both(tuned)
     assert float((found.cpu() - expected).square().mean()) < 1e-4
@@ -160,6 +165,9 @@ def test_planes_of_symmetry_are_found():
 
 def test_planes_are_judged_alike(monkeypatch):
     monkeypatch.setattr(symmetry, "PIXELS", 256)
+    monkeypatch.setattr(symmetry, "carved", partial(carved, side=24))
+    for module in (symmetry, reflections):
+        monkeypatch.setattr(module, "HULL_SIDE", 24)
 
     def judged(where):
         support = car(where, shown=4, size=16).support
@@ -186,7 +194,9 @@ def test_frames_are_judged_alike_and_rotated_fields_shown_alike():
     assert float((picture - expected[2]).square().mean()) < 1e-4
 
 
-def test_the_hull_of_views_and_reflections_looks_the_same():
+def test_the_hull_of_views_and_reflections_looks_the_same(monkeypatch):
+    monkeypatch.setattr(reflections, "HULL_SIDE", 32)
+
     def shown(where):
         task = car(where)
         return (

@@ -39,6 +39,7 @@ from hyperplanes.views import Task
 from tests.reference_rendering import Balls, small_model
 
 SMALL = {"views": 1, "normalisation": "group", "code": 16, "depth": 2, "width": 32}
+QUARTER = 512  # rays of a learned step
 ALL_LAYERS = ImageHyperNetworkConfig(
     **SMALL, layers=("all",), update="low_rank", weights_seen="all", activation="silu", rank=2
 )
@@ -120,12 +121,12 @@ def test_the_published_form_is_found_out_when_its_codes_are_dead():
 @cache
 def cars():
     """Two that look different: figures of a pair are those of its swap."""
-    return held_out(3, 64)[::2]
+    return [*held_out(1, 64), *held_out(1, 64, first=2)]
 
 
 @cache
 def lamp():
-    return held_out(2, 64, kind="lamp")[1]
+    return held_out(1, 64, kind="lamp", first=1)[0]
 
 
 pretrained = cache(HyperPlanes.from_pretrained)
@@ -179,20 +180,20 @@ def test_swapping_updates_of_cars_costs_decibels():
     assert swapped_cars(HyperPlanes.from_pretrained("cars-64"), 25) > 0.1
 
 
-@pytest.mark.parametrize(("count", "least"), [(3, 1.5), (25, 1.0)])
-def test_swapping_updates_of_cars_costs_decibels_with_few_views_and_with_many(count, least):
-    """By 4.5 and 2.4 dB; by 2.5 with 25 views before the training with three rays a pixel.
+@pytest.mark.parametrize(("count", "side", "least"), [(3, 48, 1.5), (25, 64, 1.0)])
+def test_swapping_updates_of_cars_costs_decibels_with_few_views_and_with_many(count, side, least):
+    """By 3.8 and 2.4 dB; by 2.5 with 25 views before the training with three rays a pixel.
 
     Since then a car's own update shows it as well as before, and that of the other car one of them 2.6 dB better: the
     field trusts 25 views more.
     """
-    assert swapped_cars(coarse("small", side=64), count) > least
+    assert swapped_cars(coarse("small", side=side), count) > least
 
 
 @torch.no_grad()
 def lamp_with_the_update_of_a_car(name, count):
     """What it costs in dB, where so many views are shown of both."""
-    model = coarse(name, side=64)
+    model = coarse(name)
     shown, other = (model.prepare(few(task, count)) for task in (lamp(), cars()[1]))
     query = lamp().query[:1]
     fields = [model.field(shown, model.theta + update) for update in model.updates([shown, other])]
@@ -202,7 +203,7 @@ def lamp_with_the_update_of_a_car(name, count):
 
 @pytest.mark.parametrize("count", [3, 25])
 def test_a_lamp_with_the_update_of_a_car_is_worse(count):
-    assert lamp_with_the_update_of_a_car("small", count) > 5  # measured: 9.3 and 7.5
+    assert lamp_with_the_update_of_a_car("small", count) > 5  # measured: 9.5 and 6.2
 
 
 def test_a_lamp_with_the_update_of_a_car_is_worse_with_25_planes_too():
@@ -237,7 +238,7 @@ def test_a_car_that_faces_another_way_costs_little(count, most):
 @cache
 def shape():
     """A random composition of a seed that no training has."""
-    return held_out(2, 64, kind="random")[1]
+    return held_out(1, 64, kind="random", first=1)[0]
 
 
 def quality(field, task, queries=1, **options):
@@ -255,6 +256,14 @@ def mean_psnr(adapter, task, count, queries=1):
 def car(number, count):
     """The field of so many views of a car."""
     return coarse("small").adapt(few(cars()[number], count))
+
+
+@cache
+def after_learned_steps():
+    """PSNR of `shape` from 3 views after four of them, by a fourth of the rays that users have."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learned_steps, "RAYS", QUARTER)
+        return mean_psnr(coarse("small", learned_steps=4), shape(), 3)
 
 
 @cache
@@ -289,9 +298,8 @@ def test_learned_steps_bring_decibels_by_the_gradient_that_they_read(monkeypatch
 
     Of a fourth of the rays that users have.
     """
-    monkeypatch.setattr(learned_steps, "RAYS", 512)
-    model, task = coarse("small", learned_steps=4), shape()
-    found = {"all": mean_psnr(model, task, 3)}
+    monkeypatch.setattr(learned_steps, "RAYS", QUARTER)
+    model, task, found = coarse("small", learned_steps=4), shape(), {"all": after_learned_steps()}
     for name, change in (("random", torch.randn_like), ("negative", torch.neg)):
         monkeypatch.setattr(learned_steps, "grid_gradient", partial(_changed, grid_gradient, change))
         torch.manual_seed(0)
@@ -313,11 +321,11 @@ def test_few_gradient_steps_on_few_views_do_no_harm_where_they_begin_after_the_l
 
     Both by a fourth of the rays that users have; by all of them the first end at 22.7, before which there are 22.5.
     """
-    monkeypatch.setattr(learned_steps, "RAYS", 512)
+    monkeypatch.setattr(learned_steps, "RAYS", QUARTER)
     task, settings = shape(), FineTuning(rays=256)
     begun, plain = (coarse("small", learned_steps=steps) for steps in (4, 0))
     found = [quality(model.fine_tune(few(task, 3), 10, settings), task) for model in (begun, plain)]
-    assert found[0] > mean_psnr(begun, task, 3) - 1
+    assert found[0] > after_learned_steps() - 1
     assert found[0] > found[1] + 2
 
 
@@ -331,7 +339,8 @@ def reflected(kind, count):
 def test_reflections_bring_decibels_on_symmetric_objects(kind, least):
     """By 3.5 and 6.0 dB from 3 views."""
     task = cars()[0] if kind == "car" else lamp()
-    assert quality(reflected(kind, 3), task) > mean_psnr(coarse("small"), task, 3) + least
+    alone = car(0, 3) if kind == "car" else coarse("small").adapt(few(task, 3))
+    assert quality(reflected(kind, 3), task) > quality(alone, task) + least
 
 
 def test_reflections_and_the_canonical_frame_bring_decibels_on_a_car_that_faces_another_way():
@@ -449,5 +458,6 @@ def test_residuals_of_its_own_views_bring_decibels_and_of_others_cost_many():
 
 def test_a_fine_tuned_lamp_is_shown_better_with_the_hull_beside_it():
     """By 0.6 dB; docs/image-based-measurements.md has means over many objects."""
-    tuned = with_symmetry(Symmetry(Plane((1.0, 0.0, 0.0)))).fine_tune(few(lamp(), 10), 8)
+    model, settings = with_symmetry(Symmetry(Plane((1.0, 0.0, 0.0)))), FineTuning(rays=256)
+    tuned = model.fine_tune(few(lamp(), 10), 8, settings)
     assert quality(tuned, lamp()) > quality(replace(tuned, gate=None), lamp()) + 0.3

@@ -244,7 +244,8 @@ const told = JSON.parse(sessionStorage.told || "[]");
   sessionStorage.told = JSON.stringify(told);
   const next = addresses[told.length - 1];
   if (next) location.hash = "#camera=" + pose + next;
-  setTimeout(() => fetch("/told", { method: "POST", body: told.join(", ") }), 5000); // unless it is loaded anew
+  const tell = () => fetch("/told", { method: "POST", body: told.join(", ") });
+  setTimeout(tell, next ? 5000 : 500); // unless it is loaded anew
 })();
 """
 

@@ -3,13 +3,17 @@
 Source of truth: the "Tile" and "AMX" instructions of Intel's manual (Software Developer's Manual, volume 2).
 """
 
+import hashlib
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
-from llvmlite import ir
+import pytest
+from llvmlite import binding, ir
 from numba import carray, cfunc, njit, types
-from numba.core import cgutils
+from numba.core import cgutils, config
 
 from hyperplanes.geometry.kernels import compiling, layers_amx
 
@@ -21,7 +25,6 @@ TILE = ROWS * BYTES
 _memory = types.CPointer(types.uint8)
 
 
-@cfunc(types.void(_memory, types.uint8, _memory, types.int64))
 def _load(tiles, tile, source, pitch):
     to, given = carray(tiles, 8 * TILE), carray(source, (ROWS - 1) * pitch + BYTES)
     for row in range(ROWS):
@@ -29,7 +32,6 @@ def _load(tiles, tile, source, pitch):
             to[tile * TILE + row * BYTES + byte] = given[row * pitch + byte]
 
 
-@cfunc(types.void(_memory, types.uint8, _memory, types.int64))
 def _store(tiles, tile, target, pitch):
     given, to = carray(tiles, 8 * TILE), carray(target, (ROWS - 1) * pitch + BYTES)
     for row in range(ROWS):
@@ -37,29 +39,52 @@ def _store(tiles, tile, target, pitch):
             to[row * pitch + byte] = given[tile * TILE + row * BYTES + byte]
 
 
-@cfunc(types.void(_memory, types.uint8, types.uint8, types.uint8))
 def _add_products(tiles, total, one, other):
     memory = carray(tiles, 8 * TILE)
     sums = memory[total * TILE : (total + 1) * TILE].view(np.float32)
-    # numbers of bfloat16 are the upper halves of single ones
-    left = (memory[one * TILE : (one + 1) * TILE].view(np.uint16).astype(np.uint32) << np.uint32(16)).view(np.float32)
-    right = (memory[other * TILE : (other + 1) * TILE].view(np.uint16).astype(np.uint32) << np.uint32(16)).view(
-        np.float32
-    )
+    # numbers of bfloat16 are the upper halves of single ones, and two of them one word, the first one below
+    low, high = np.uint32(16), np.uint32(0xFFFF0000)
+    left, right = memory[one * TILE : (one + 1) * TILE].view(np.uint32), memory[other * TILE : (other + 1) * TILE]
+    right = right.view(np.uint32)
+    lefts = (left << low).view(np.float32), (left & high).view(np.float32)
+    rights = (right << low).view(np.float32), (right & high).view(np.float32)
     for row in range(ROWS):
         for pair in range(ROWS):
-            for column in range(ROWS):
-                for half in range(2):
-                    product = left[2 * (ROWS * row + pair) + half] * right[2 * (ROWS * pair + column) + half]
-                    sums[ROWS * row + column] += product
+            for half in range(2):
+                factor = lefts[half][ROWS * row + pair]
+                for column in range(ROWS):
+                    sums[ROWS * row + column] += factor * rights[half][ROWS * pair + column]
 
 
-FUNCTIONS = {"tileloadd64": _load, "tilestored64": _store, "tdpbf16ps": _add_products}
+_copying = types.void(_memory, types.uint8, _memory, types.int64)
+FUNCTIONS = {
+    "tileloadd64": (_load, _copying),
+    "tilestored64": (_store, _copying),
+    "tdpbf16ps": (_add_products, types.void(_memory, types.uint8, types.uint8, types.uint8)),
+}
+
+
+@contextmanager
+def _cache_folder():
+    """While this lasts, numba's folder is that of the kernels' sources and of this file."""
+    name = f"emulated-{hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]}"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(config, "CACHE_DIR", str(Path(compiling._cache_folder()) / name))
+        yield
+
+
+@cache
+def _instructions():
+    """The functions by name, as symbols that kernels call: an address would be that of one process alone."""
+    compiled = {name: cfunc(kind, cache=True)(function) for name, (function, kind) in FUNCTIONS.items()}
+    for name, function in compiled.items():
+        binding.add_symbol(f"emulated_{name}", function.address)
+    return compiled
 
 
 @cache
 def emulated_kernel(name):
-    """The function of `compile_kernel(name, torch.float32)`; what is compiled is kept nowhere else.
+    """The function of `compile_kernel(name, torch.float32)`.
 
     Args:
         name: "layers_amx.layers" or "layers_amx_bfloat16.layers".
@@ -75,13 +100,15 @@ def emulated_kernel(name):
         numbers = [ir.Constant(ir.IntType(8), each) if isinstance(each, int) else each for each in arguments]
         given = [builder.bitcast(registers[of_function], ir.IntType(8).as_pointer()), *numbers]
         kind = ir.FunctionType(ir.VoidType(), [each.type for each in given])
-        place = ir.Constant(ir.IntType(64), FUNCTIONS[name].address)
-        builder.call(builder.inttoptr(place, kind.as_pointer()), given)
+        builder.call(cgutils.get_or_insert_function(builder.module, kind, f"emulated_{name}"), given)
 
     original, layers_amx._call = layers_amx._call, call
     try:
         module = import_module(f"hyperplanes.geometry.kernels.{name.removesuffix('.layers')}")
         signature = compiling._SIGNATURES[name].replace("T[", "float32[")
-        return njit(f"void({signature})", nogil=True, error_model="numpy", fastmath=compiling.FASTMATH)(module.layers)
+        options = {"nogil": True, "error_model": "numpy", "fastmath": compiling.FASTMATH, "cache": True}
+        with _cache_folder():
+            _instructions()
+            return njit(f"void({signature})", **options)(module.layers)
     finally:
         layers_amx._call = original
