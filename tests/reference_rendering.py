@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
 
 import torch
@@ -116,11 +118,15 @@ class Balls:
 
     def ball(self, number: float, name: str) -> Task:
         """A ball whose colour and size are those of this number, 0 to 8."""
-        colour = (0.15 + 0.1 * number, 0.9 - 0.1 * number, 0.3)
-        radius = 0.4 + 0.04 * number
-        support = ball_views(ring(self.views, self.size), colour=colour, radius=radius)
-        query = ball_views(ring(self.views, self.size, shift=1), colour=colour, radius=radius)
-        return Task(support, query, name)
+        return Task(*copy.deepcopy(_drawn_ball(self.views, self.size, number)), name)  # tests may change their pixels
+
+
+@functools.cache
+def _drawn_ball(views: int, size: tuple[int, int], number: float) -> tuple[Views, Views]:
+    colour = (0.15 + 0.1 * number, 0.9 - 0.1 * number, 0.3)
+    rings = (ring(views, size, shift=shift) for shift in (0, 1))
+    support, query = (ball_views(each, colour=colour, radius=0.4 + 0.04 * number) for each in rings)
+    return support, query
 
 
 def small_model(**changes):

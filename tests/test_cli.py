@@ -554,7 +554,7 @@ def test_pictures_of_many_views_are_corrected_unless_that_is_off(tmp_path, monke
     scene = first_views(locate_scene("example-car"), tmp_path / "scene", support=MANY_VIEWS, query=2)
     command = ["--checkpoint", "small", "--views", str(scene), "--downscale", "4"]
     monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path / "cache"))
-    with small_packaged():
+    with small_packaged(learned_steps=0):
         assert main(["render", *command, "--out", str(tmp_path / "corrected")]) == 0
         assert "2 pictures corrected by residuals" in capsys.readouterr().out
         # no support view is rendered where pictures are not corrected: for these, for their estimate, nor for voxels

@@ -141,9 +141,10 @@ def _from_outside(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Te
     around = torch.cartesian_prod(*[torch.arange(-1, 2, device=left.device)] * 3) @ steps
     layer = (left & dilate(~left)).flatten().nonzero()[:, 0]
     shape, left = left.shape, left.flatten()
+    sides = torch.tensor(shape, device=left.device)
     depth = torch.where(left, torch.inf, 0.0)
     while len(layer):
-        places = torch.stack(torch.unravel_index(layer, shape), 1) - 1 + corner
+        places = layer[:, None] // steps % sides - 1 + corner  # torch.unravel_index takes 0.3 s to import sympy
         found = _densities(grid.centres_of(places), density) * grid.voxel
         depth[layer], left[layer] = found.to(depth), False
         beside = (layer[found < OPAQUE][:, None] + around).flatten()

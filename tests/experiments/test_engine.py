@@ -39,7 +39,8 @@ def out(tmp_path_factory):
 @pytest.fixture(scope="module")
 def cars(out):
     """The data set that `reproduce` generates where none is given."""
-    with rendered_here():
+    with rendered_here(), pytest.MonkeyPatch.context() as patch:
+        leave_figures_out(patch)
         assert main(["reproduce", "time", "--scale", "smoke", "--only", "HyperPlanes-0", "--out", str(out)]) == 0
     (folder,) = (out / "data").glob("car-*")
     return folder
@@ -65,10 +66,14 @@ def reproduced(out, given):
     return run
 
 
+def leave_figures_out(patch):
+    """The figure of each experiment is drawn once, by `reproduced`."""
+    patch.setattr("hyperplanes.utilities.plots.encode_figure", lambda figure, kind: b"")
+
+
 @pytest.fixture
 def without_figures(monkeypatch):
-    """The figure of each experiment is drawn once, by `reproduced`."""
-    monkeypatch.setattr("hyperplanes.utilities.plots.encode_figure", lambda figure, kind: b"")
+    leave_figures_out(monkeypatch)
 
 
 @dataclass(frozen=True)
@@ -116,6 +121,7 @@ def test_nothing_is_made_twice_and_what_is_missing_is_made_again(out, given, rep
     assert (out / "target" / "table.csv").read_bytes() == table
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_processes_side_by_side_find_what_one_does(out, given, tmp_path):
     command = ["reproduce", "target", "--scale", "smoke", "--only", "NeRF", "MultiPlaneNeRF", *given, "--out"]
     assert main([*command, str(out)]) == 0

@@ -24,6 +24,15 @@ def test_nothing_that_is_filled_is_lost_and_little_else_is_kept():
     assert float(grid.occupied.float().mean()) * 8 < grown
 
 
+def test_a_brick_of_another_length_along_each_axis_is_kept_where_it_stands():
+    # Source of truth: the voxels whose centres lie in it, and those beside them.
+    centre, half = torch.tensor([0.3, -0.2, 0.1]), torch.tensor([0.5, 0.3, 0.2])
+    centres = full(Sphere(), 32).centres()
+    start, inside = (((centres - centre).abs() < half + more).all(1).view(32, 32, 32) for more in (0.13, 0.0))
+    found = refine(Occupancy(start, Sphere()), lambda points: 50.0 * ((points - centre).abs() < half).all(1).float())
+    assert torch.equal(found.occupied, Occupancy(inside, Sphere()).dilated().occupied)
+
+
 def test_a_refined_grid_never_grows():
     start = refine(full(Sphere(), 32), ball(0.3))
     again = refine(start, ball(0.9))

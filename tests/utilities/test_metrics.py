@@ -1,13 +1,19 @@
 """Sources of truth: scikit-image's PSNR and SSIM, and a constant error by hand."""
 
 import math
+from importlib import import_module
 
 import numpy as np
 import pytest
 import torch
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
+
+
+@pytest.fixture(scope="module")
+def scikit_image():
+    """`skimage.metrics`, which takes half a second to import: not of each process that looks for tests."""
+    return import_module("skimage.metrics")
 
 
 def pairs(size=(24, 31), noise=0.1):
@@ -23,19 +29,20 @@ def as_image(image):
     return image.permute(1, 2, 0).double().numpy()
 
 
-def test_psnr_equals_scikit_images():
+def test_psnr_equals_scikit_images(scikit_image):
     predicted, truth = pairs()
     expected = [
-        peak_signal_noise_ratio(as_image(t), as_image(p), data_range=1) for p, t in zip(predicted, truth, strict=True)
+        scikit_image.peak_signal_noise_ratio(as_image(t), as_image(p), data_range=1)
+        for p, t in zip(predicted, truth, strict=True)
     ]
     np.testing.assert_allclose(psnr(predicted, truth).numpy(), expected, atol=1e-4)
 
 
-def test_ssim_equals_scikit_images():
+def test_ssim_equals_scikit_images(scikit_image):
     predicted, truth = pairs()
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     expected = [
-        structural_similarity(as_image(t), as_image(p), data_range=1, channel_axis=2, **window)
+        scikit_image.structural_similarity(as_image(t), as_image(p), data_range=1, channel_axis=2, **window)
         for p, t in zip(predicted, truth, strict=True)
     ]
     np.testing.assert_allclose(ssim(predicted, truth).numpy(), expected, atol=1e-5)
@@ -67,9 +74,9 @@ def test_ssim_refuses_images_smaller_than_its_window():
     assert torch.isfinite(ssim(torch.rand(1, 3, 11, 11), torch.rand(1, 3, 11, 11))).all()
 
 
-def test_the_pooled_psnr_is_scikit_images_of_all_pixels():
+def test_the_pooled_psnr_is_scikit_images_of_all_pixels(scikit_image):
     predicted, truth = pairs()
-    expected = peak_signal_noise_ratio(truth.double().numpy(), predicted.double().numpy(), data_range=1)
+    expected = scikit_image.peak_signal_noise_ratio(truth.double().numpy(), predicted.double().numpy(), data_range=1)
     assert pooled_psnr(predicted, truth).item() == pytest.approx(expected, abs=1e-4)
     assert pooled_psnr(predicted, truth) < psnr(predicted, truth).mean()
 
