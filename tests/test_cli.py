@@ -560,6 +560,10 @@ def test_pictures_of_many_views_are_corrected_unless_that_is_off(tmp_path, monke
         # no support view is rendered where pictures are not corrected: for these, for their estimate, nor for voxels
         monkeypatch.setattr(ResidualField, "_compute", lambda *_: pytest.fail("a support view was rendered"))
         assert main(["render", *command, "--out", str(tmp_path / "plain"), "--residuals", "off"]) == 0
+        capsys.readouterr()
+        tuned = ["--out", str(tmp_path / "tuned"), "--steps", "1"]
+        assert main(["render", *command, *tuned, "--residuals", "off"]) == 0
+        assert "averaged with hull_blend" in capsys.readouterr().out
         suitability.held_out_psnr(HyperPlanes.from_pretrained("small"), read_task(scene).support.resized(32))
         voxels = ["--out", str(tmp_path / "voxels.safetensors"), "--voxels", "16", "--fit", "0"]
         assert main(["bake", *command, *voxels]) == 0

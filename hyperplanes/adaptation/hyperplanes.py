@@ -50,6 +50,11 @@ class HyperPlanes(HyperPlanesNetwork):
         self.config = replace(self.config, symmetric=False, symmetry=None)
         return self
 
+    def without_residuals(self) -> Self:
+        """This model, whose pictures are from now on not corrected by residuals (`adaptation.residuals`)."""
+        self.config = replace(self.config, residuals=False)
+        return self
+
     @checked
     @without_autocast
     @torch.inference_mode(mode=False)  # learned steps read gradients
@@ -103,10 +108,10 @@ class HyperPlanes(HyperPlanesNetwork):
         It begins at theta + delta, of which `settings.fresh` is replaced by random weights. Either these weights
         themselves are optimised, or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes,
         section 3, fine-tuning). No step is the field of `adapt`. From 20 views on the weights' grid of features
-        gets more cells (`settings.cells`). Pictures are corrected as those of `adapt`; where they are not, from ten
-        views on and by a model with a gating network, they are means with those of the visual hull
-        (`stacking.tuned_field`). From fewer views they are means with those of the field before the steps
-        (`settings.average`).
+        gets more cells (`settings.cells`). From ten views on pictures are corrected as those of `adapt`. Where the
+        model does not correct them (`without_residuals`, or large views), but has a gating network, they are means with
+        those of the visual hull (`stacking.tuned_field`). From fewer views they are means with those of the field
+        before the steps (`settings.average`).
 
         Args:
             support: the views of the object.

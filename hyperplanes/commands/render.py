@@ -105,7 +105,7 @@ class Asked:
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt, render, write, and say how well it went where the truth is known."""
-    from hyperplanes.adaptation.base import AdaptedField
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.adaptation.residuals import CorrectedField, ResidualField
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
@@ -134,9 +134,9 @@ def run(arguments: Arguments) -> int:
     shown, known = task.support.to(device), task.query.to(device)
     asked = _asked(arguments, shown, known, up, console)
     settings = FineTuning(trainable=arguments.fine_tune)
+    if isinstance(source, HyperPlanes) and (arguments.residuals == "off" or arguments.protocol != "default"):
+        source = source.without_residuals()
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
-    if isinstance(field, AdaptedField) and (arguments.residuals == "off" or arguments.protocol != "default"):
-        field = field.without_residuals()
     make = partial(bake_field, fit=VOXEL_STEPS, console=console)
     field = choose_representation(field, shown, asked.cameras, _representation(arguments, asked), make=make)
     if arguments.residuals == "on" and not isinstance(field, CorrectedField):

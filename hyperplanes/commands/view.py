@@ -173,7 +173,7 @@ def _fields(
     from hyperplanes.parameters import Parameters
 
     if not steps:
-        yield 0, model.adapt_to(context).without_residuals()
+        yield 0, model.adapt_to(context)
         return
     descent, variables = make_descent(model, context, FineTuning(), views)
     average = average_of(model, context, FineTuning(), variables)
@@ -200,6 +200,7 @@ def _adapt(
     from hyperplanes.export.baking import BakedScene, default_side
 
     console.say(f"adapting to {len(shown)} views")
+    model = model.without_residuals()  # for which the page would wait too long
     placed, steps = to_canonical_frame(model, shown), arguments.steps if len(shown) > 1 else 0
     context, field = placed.context(model), None
     for done, made in _fields(model, context, trained_on(context, placed.views), steps):

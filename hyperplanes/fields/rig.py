@@ -77,13 +77,10 @@ def match(rig: Float[Tensor, "plane 3"], standing: Float[Tensor, "view 3"]) -> I
         rig: camera directions of the planes in training, on the CPU.
         standing: those of the views, on the CPU.
     """
-    cost = (1 - rig @ standing.T).double().numpy()
-    copies = -(-len(rig) // len(standing))  # of each view, so that there are enough for all planes
-    nearest = cost.argmin(1)
-    if np.bincount(nearest).max() <= copies:  # nothing is nearer, and scipy.optimize takes 0.3 s to import
-        return torch.as_tensor(nearest)
     from scipy.optimize import linear_sum_assignment
 
+    cost = (1 - rig @ standing.T).double().numpy()
+    copies = -(-len(rig) // len(standing))  # of each view, so that there are enough for all planes
     _, column = linear_sum_assignment(np.tile(cost, (1, copies)))
     return torch.as_tensor(column % len(standing))
 
