@@ -55,8 +55,6 @@ if not STARTS_OTHERS:  # the process that starts others (`make test`) runs no te
 
     from hyperplanes.adaptation import learned_steps
 
-    os.fsync = lambda descriptor: None  # no test cuts the power, and waiting for the disk is a twentieth of their time
-
     ALL_RAYS, learned_steps.RAYS = learned_steps.RAYS, 128  # a step takes a tenth of the time so
 
 

@@ -90,12 +90,6 @@ def judge_whole(read, folder):
     return None
 
 
-def rewrite(path: Path, data: bytes) -> None:
-    """A new file in the place of an old one: some file systems put one that is made empty first on the disk at once."""
-    path.unlink()
-    path.write_bytes(data)
-
-
 def run_campaign(cases, seed, home: Path, kinds=None, report=lambda failure: None):
     """Failures of these cases.
 
@@ -117,11 +111,11 @@ def run_campaign(cases, seed, home: Path, kinds=None, report=lambda failure: Non
         folder, files, read = made[kind]
         file = draw.choice(files)
         before = (folder / file).read_bytes()
-        rewrite(folder / file, mutate(before, file.name, draw))
+        (folder / file).write_bytes(mutate(before, file.name, draw))
         wrong = judge(read, folder)
         if wrong is not None:
             failures.append(Failure(case, kind, str(file), wrong))
             report(failures[-1])
             shutil.copy(folder / file, home / f"case-{case}-{file.name}")
-        rewrite(folder / file, before)
+        (folder / file).write_bytes(before)
     return failures
