@@ -133,7 +133,7 @@ def read_path(
 
     listed = locate_scene(scene)
     listed = listed if listed.is_file() else listed / "transforms.json"
-    document = read_json(listed) if listed.is_file() else None
+    document = read_json(listed) if listed.suffix == ".json" and listed.is_file() else None
     found = read_camera_path(path, transforms, document)
     cameras = upright_cameras(found.cameras, up)
     away = (camera.centres(cameras) - cameras.extrinsics.new_tensor(shown.bounds.centre)).norm(dim=1)
