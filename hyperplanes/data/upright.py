@@ -127,7 +127,7 @@ def upright(views: Views, up: str) -> Views:
     """
     turn = y_up_from(up)
     if up == "y":
-        return views
+        return views if views.up in (None, "y") else replace(views, up="y")
     cameras = upright_cameras(views.cameras, up)
     x, y, z = (turn[:3, :3] @ torch.tensor(views.bounds.centre, dtype=torch.float64)).tolist()
     return replace(views, cameras=cameras, bounds=Sphere((x, y, z), views.bounds.radius), up=views.up and "y")
