@@ -121,12 +121,13 @@ def run(arguments: Arguments) -> int:
 
 def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
     """The methods to compare with, by name."""
-    from hyperplanes.adaptation.checkpoints import find_checkpoint
+    from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
     from hyperplanes.methods import Request, make_method
 
     if not arguments.compare:
         return {}
-    checkpoints = {"hyperplanes": find_checkpoint(arguments.checkpoint)} if not arguments.checkpoint.is_file() else {}
+    model = arguments.checkpoint
+    checkpoints = {} if model.is_file() else find_checkpoints([model]) | {"hyperplanes": find_checkpoint(model)}
     reflections = not arguments.no_reflections
     return {
         name: make_method(Request(name, checkpoints, device=device, reflections=reflections))
