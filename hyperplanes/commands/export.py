@@ -120,6 +120,9 @@ def run(arguments: Arguments) -> int:
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     given = {
+        "--steps": arguments.steps != 0,
+        "--learn-background": arguments.learn_background,
+        "--refine-poses": arguments.refine_poses,
         "--page-voxels": arguments.page_voxels is not None,
         "--no-reflections": arguments.no_reflections,
         # splats are fitted, whatever their voxels come from

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.console import Console
-    from hyperplanes.export.baking import BakedScene
     from hyperplanes.views import Task, Views
 
 __all__ = ["refine_task"]
@@ -24,7 +23,7 @@ JUDGED = 128  # pixels along the longer side of the pictures on which poses are 
 LEAST_GAIN = 0.5  # decibels; four views say no more, and right poses become a little worse
 
 
-def refine_task(source: HyperPlanes | BakedScene, task: Task, console: Console, *, all_views: bool = False) -> Task:
+def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views: bool = False) -> Task:
     """The views with refined poses, or as they are where a field of the refined ones shows left-out views no better.
 
     Support and query are refined together; only support views decide which poses are taken. What was found is kept
@@ -37,15 +36,12 @@ def refine_task(source: HyperPlanes | BakedScene, task: Task, console: Console, 
         all_views: both are the same.
 
     Raises:
-        ValueError: a baked scene, which adapts to nothing, or too few views.
+        ValueError: too few views.
     """
     from hyperplanes.adaptation.kept import keep_tensors, kept_file, recall_tensors
-    from hyperplanes.export.baking import BakedScene
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.views import Task, join_views
 
-    if isinstance(source, BakedScene):
-        raise ValueError("--refine-poses: expected a model that adapts to the views, got a baked file")
     count, started = len(task.support), time.perf_counter()
     views = task.support if all_views else join_views(task.support, task.query)
     file = kept_file("poses", views, source, count)

@@ -122,6 +122,9 @@ def run(arguments: Arguments) -> int:
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     given = {
+        "--steps": arguments.steps != 0,
+        "--learn-background": arguments.learn_background,
+        "--refine-poses": arguments.refine_poses,
         "--protocol": arguments.protocol != "default",
         "--fine-tune": arguments.fine_tune != "weights",
         "--no-reflections": arguments.no_reflections,

@@ -52,19 +52,15 @@ def prepare_task(
         source: what will adapt to them.
         console: where it is said.
         all_views: both are the same.
-
-    Raises:
-        ValueError: a baked file, which adapts to nothing, and an option that is for adapting.
     """
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.background import cut_out_task
     from hyperplanes.commands.poses import refine_task
-    from hyperplanes.export.baking import BakedScene
 
     if arguments.learn_background:
-        if isinstance(source, BakedScene):
-            raise ValueError("--learn-background: expected a model that adapts to the views, got a baked file")
         task = cut_out_task(task, console, all_views=all_views)
     if arguments.refine_poses:
+        assert isinstance(source, HyperPlanes)
         task = refine_task(source, task, console, all_views=all_views)
     return task
 

@@ -81,10 +81,14 @@ def run(arguments: Arguments) -> int:
     )  # viser's, of visitors who left
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
-    if not arguments.compare:
-        given = {"--no-reflections": arguments.no_reflections, "--fit": arguments.fit != Arguments.fit}
-        refuse_of_baked(source, given)
-    refuse_of_baked(source, {"--steps": arguments.steps != 0})
+    given = {
+        "--steps": arguments.steps != 0,
+        "--learn-background": arguments.learn_background,
+        "--refine-poses": arguments.refine_poses,
+        "--no-reflections": arguments.no_reflections and not arguments.compare,
+        "--fit": arguments.fit != Arguments.fit and not arguments.compare,
+    }
+    refuse_of_baked(source, given)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
     shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()

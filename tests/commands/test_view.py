@@ -131,6 +131,14 @@ def test_the_model_is_compared_with_by_the_name_of_its_method_too(tmp_path):
     assert [found[name].config for name in names[:2]] == [model.config] * 2
 
 
+@pytest.mark.parametrize("option", [["--steps", "1"], ["--refine-poses"], ["--learn-background"], ["--fit", "0"]])
+def test_a_baked_file_is_finished(option, viewer, monkeypatch, capsys):
+    monkeypatch.setattr(view, "load_source", lambda *_, **__: baking.BakedScene(None))
+    monkeypatch.setattr(view, "read_scene", None)  # refused before pictures are read
+    assert main(["view", "example-car", *option]) == 2
+    assert f"{option[0]}: expected none with a baked file" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("part", ["baking", "fitting"])
 def test_voxels_give_way_to_another_number_of_views(part, monkeypatch):
     def move(title, done):
