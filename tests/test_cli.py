@@ -337,6 +337,10 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
                 (["evaluate", "--data", "example-car", "--method", "nearest_view"], "the layout posed"),
             )
         ),
+        *(
+            (["capture", "DATA", "--out", "OUT/x", *option.split()], [f"{option.split()[0]}: expected a whole number"])
+            for option in ("--size 63", "--size 100000", "--frames 2")
+        ),
         (["inspect", "OUT/none"], ["OUT/none: expected a data set, posed images, a checkpoint", "found nothing"]),
     ],
 )
