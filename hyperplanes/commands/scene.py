@@ -83,7 +83,7 @@ def read_scene(
         Views of a world with y up, and the direction that was up before.
     """
     from hyperplanes.data.dataset import locate_scene
-    from hyperplanes.data.formats.recognise import read_posed, read_posed_task
+    from hyperplanes.data.formats.recognise import read_posed, read_posed_task, scene_name
     from hyperplanes.data.upright import upright_task
     from hyperplanes.utilities.files import malformed
     from hyperplanes.views import Task
@@ -93,7 +93,7 @@ def read_scene(
         if all_views:
             scene = read_posed(path, downscale)
             views, notes = scene.views(), scene.notes
-            task = Task(views, views, path.resolve().name)
+            task = Task(views, views, scene_name(path))
         else:
             posed = read_posed_task(path, downscale)
             task, notes = posed.task(), posed.notes
