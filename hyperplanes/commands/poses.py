@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["refine_task"]
 
-JUDGED = 128  # pixels along the longer side of the pictures on which poses are compared
+JUDGED = 128  # pixels along the longer side of the views that are shown to compare poses
 LEAST_GAIN = 0.5  # decibels; four views say no more, and right poses become a little worse
 
 
@@ -39,6 +39,7 @@ def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views:
         ValueError: too few views.
     """
     from hyperplanes.adaptation.kept import keep_tensors, kept_file, recall_tensors
+    from hyperplanes.evaluation.suitability import HELD_OUT_SIZE
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.views import Task, join_views
 
@@ -52,7 +53,7 @@ def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views:
         how = format_duration(time.perf_counter() - started)
         keep_if_possible(file, partial(keep_tensors, file, found), console)
     before, after = found["psnr"].tolist()
-    figures = f"support views left out have {after:.2f} dB with them, {before:.2f} as given (64 pixels); {how}"
+    figures = f"support views left out have {after:.2f} dB with them, {before:.2f} as given ({HELD_OUT_SIZE} pixels); {how}"
     if after < before + LEAST_GAIN:
         console.say(f"poses: as given, refined ones are not better by {LEAST_GAIN:g} dB: {figures}")
         return task
