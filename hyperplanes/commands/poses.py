@@ -35,8 +35,7 @@ def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views:
         console: where it is said.
         all_views: both are the same.
 
-    Raises:
-        ValueError: too few views.
+    Too few views are a ValueError.
     """
     from hyperplanes.adaptation.kept import keep_tensors, kept_file, recall_tensors
     from hyperplanes.evaluation.suitability import HELD_OUT_SIZE
@@ -53,7 +52,8 @@ def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views:
         how = format_duration(time.perf_counter() - started)
         keep_if_possible(file, partial(keep_tensors, file, found), console)
     before, after = found["psnr"].tolist()
-    figures = f"support views left out have {after:.2f} dB with them, {before:.2f} as given ({HELD_OUT_SIZE} pixels); {how}"
+    figures = f"support views left out have {after:.2f} dB with them, {before:.2f} as given"
+    figures += f" ({HELD_OUT_SIZE} pixels); {how}"
     if after < before + LEAST_GAIN:
         console.say(f"poses: as given, refined ones are not better by {LEAST_GAIN:g} dB: {figures}")
         return task
