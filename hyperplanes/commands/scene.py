@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -172,11 +173,7 @@ def _is_seen(bounds: Sphere, cameras: PinholeCamera) -> bool:
     angle = torch.acos(((away * camera.viewing_directions(cameras)).sum(-1) / distance).clamp(-1, 1))
     radius = torch.asin((bounds.radius / distance).clamp_max(1.0))
     height, width = camera.image_size(cameras)
-    cone = torch.atan(
-        torch.tensor(float(height), dtype=angle.dtype).hypot(angle.new_tensor(float(width)))
-        / 2
-        / camera.intrinsics(cameras)[:, 0, 0]
-    )
+    cone = torch.atan(math.hypot(height, width) / 2 / camera.intrinsics(cameras)[:, 0, 0])
     return bool(((angle < cone + radius) | (distance < bounds.radius)).any())
 
 
