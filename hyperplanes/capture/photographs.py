@@ -202,7 +202,7 @@ def read_upright(
 
 
 def scaled_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
-    """(height, width) scaled down so that the longer side has so many pixels at most.
+    """(height, width) scaled down so that the longer side has at most `max_size` pixels.
 
     >>> scaled_size((3000, 4000), 1000)
     (750, 1000)

@@ -1,6 +1,6 @@
 """Turn photographs or a video of an object into a scene that the other verbs read: camera poses, masks, what is up.
 
-Needs the extra `photos`: pip install 'hyperplanes[photos]'. What was interrupted goes on where it was.
+Needs the extra `photos`: pip install 'hyperplanes[photos]'. An interrupted capture resumes where it stopped.
 
 Example:
     hyperplanes capture photos/ --out scene

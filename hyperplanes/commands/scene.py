@@ -77,7 +77,7 @@ def read_scene(
         path: of the posed images, or the name of a scene that comes with the package.
         console: where it is said.
         all_views: whether all are shown.
-        up: the direction that points up in their world, as in `y_up_from`, or auto: as the cameras are held.
+        up: the direction that points up in their world, as in `y_up_from`, or auto: from how the cameras are held.
         downscale: as in `read_views`.
 
     Returns:
@@ -178,7 +178,7 @@ def _is_seen(bounds: Sphere, cameras: PinholeCamera) -> bool:
 
 
 def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
-    """The direction that is up in the world of one scene: as stated, as its cameras are held, or y.
+    """The direction that is up in the world of one scene: as stated, from how its cameras are held, or y.
 
     Args:
         parts: of the scene.
@@ -188,13 +188,13 @@ def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
     from hyperplanes.geometry import cameras as camera
 
     if (stated := parts[0].up) is not None:
-        console.say(f"up: {stated}, as the files say; --up says otherwise")
+        console.say(f"up: {stated}, as the files say; --up overrides it")
         return stated
     guessed = guess_up(camera.concatenate([part.cameras for part in parts]))
     console.say(
-        f"up: {guessed}, as the cameras are held; --up says otherwise"
+        f"up: {guessed}, from how the cameras are held; --up overrides it"
         if guessed
-        else "up: y; the cameras do not tell, --up says otherwise"
+        else "up: y, as the cameras do not tell; --up overrides it"
     )
     return guessed or "y"
 

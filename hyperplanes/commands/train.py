@@ -1,9 +1,9 @@
 """Train a model on a data set; what `generate` writes, or any other layout that `inspect` can read.
 
 The model is evaluated on held-out objects at intervals. Checkpoints are written to --out on the way; interrupted, the
-same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once; SIGTERM, as a
-cluster sends it, stops after a checkpoint too. Beside the weights lie config.yaml, which --config takes, curve.csv, and
-samples/ with held-out views beside the truth; best/ holds the model that was best on held-out objects.
+same command goes on from the last one. Ctrl-C stops after a checkpoint; a second Ctrl-C stops immediately.
+SIGTERM, as a cluster sends it, stops after a checkpoint too. Beside the weights lie config.yaml, which --config takes,
+curve.csv, and samples/ with held-out views beside the truth; best/ holds the model that was best on held-out objects.
 
 With --devices N, N processes of this machine share the objects of every step, one a GPU; --nodes M takes as many on
 each of M machines. Started by torchrun, it takes the processes that torchrun has started.

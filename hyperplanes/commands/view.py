@@ -154,7 +154,7 @@ def _show_others(
 ) -> None:
     """Shows the other methods one after the other.
 
-    Of one that does not take so few views it is said why.
+    Where one does not take so few views, the reason is said.
     """
     for name, adapter in others.items():
         _check(wanted)

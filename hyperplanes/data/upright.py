@@ -28,7 +28,7 @@ LEVEL = 0.1  # sine of the tilt, root mean square over the cameras, up to which 
 def guess_up(cameras: PinholeCamera) -> str | None:
     """The direction that is up in the world, as people and programs hold cameras: level, and not upside down.
 
-    The horizontal axis of a level camera is perpendicular to it. An axis of the world goes first; else it is the
+    The horizontal axis of a level camera is perpendicular to it. An axis of the world goes first; otherwise it is the
     direction that all horizontal axes are most nearly perpendicular to.
 
     Returns:

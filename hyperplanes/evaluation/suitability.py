@@ -40,7 +40,8 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
         )
     planes = model.config.network.planes
     if len(shown) < planes and len(model.known_rig):
-        found.append(f"{len(shown)} views are shown and the model was trained with {planes}: some stand for several")
+        stated = f"{len(shown)} views are shown and the model was trained with {planes}"
+        found.append(f"{stated}: some views fill several planes")
     unlike, angle = _unlikeness(model, shown)
     if unlike is not None and unlike > UNLIKE:
         found.append(

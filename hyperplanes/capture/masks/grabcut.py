@@ -71,7 +71,7 @@ def extended(
     mask: Float[np.ndarray, "height width"],
     possible: Bool[np.ndarray, "row column"],
 ) -> Float[np.ndarray, "height width"]:
-    """A mask and what resembles it, as far as edges of the picture.
+    """A mask and what resembles it, up to edges of the picture.
 
     Args:
         picture: 8-bit RGB.

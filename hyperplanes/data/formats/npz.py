@@ -115,7 +115,7 @@ def read_arrays(path: str | Path, names: set[str], root: Path | None = None) -> 
 
 
 def read_array(path: Path, expected: str, largest: int, root: Path) -> npt.NDArray[Any]:
-    """The content of an .npy file of so many bytes at most; what is broken, or a pickle, is a DataError."""
+    """The content of an .npy file of at most `largest` bytes; what is broken, or a pickle, is a DataError."""
     with malformed(path, expected):
         return np.load(io.BytesIO(read_bytes(path, largest, root)), allow_pickle=False)
 

@@ -36,7 +36,7 @@ class Layout:
         found: what is true of a folder in it.
         read: all of its pictures; a folder, a factor to scale down by, and the root that no file may lie outside of,
             symbolic links followed.
-        read_task: support and query, where the layout has splits of its own; views alternate else.
+        read_task: support and query, where the layout has splits of its own; otherwise views alternate.
     """
 
     found: Callable[[Path], object]
@@ -89,7 +89,7 @@ def find_layouts() -> tuple[Layout, ...]:
 def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
     """The catalogue of whatever lies at a path.
 
-    A manifest.json that names its layout decides; else the folder's content does: a posed scene (one object, in the
+    A manifest.json that names its layout decides, otherwise the folder's content: a posed scene (one object, in the
     test split), SRN's, learnit's, the HyperPlanes authors', NMR's, CO3D's, Objaverse's or OmniObject3D's layout, or a
     folder of posed scenes (all in the test split).
 

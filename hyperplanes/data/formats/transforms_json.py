@@ -77,7 +77,7 @@ def read_transforms_task(
     """Support and query of one scene.
 
     transforms_train.json is the support and transforms_test.json (or _val) the query where they are; in one
-    transforms.json, `train_filenames` and `test_filenames` decide; else views alternate, the first one support.
+    transforms.json, `train_filenames` and `test_filenames` decide; otherwise views alternate, the first one support.
 
     Args:
         path: the folder that holds the files, or one file that is all there is.
