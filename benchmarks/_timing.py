@@ -7,10 +7,11 @@ import os
 import statistics
 import time
 import tracemalloc
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
+from unittest.mock import patch
 
 import torch
 
@@ -147,17 +148,11 @@ def _text(value: object) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-@contextmanager
-def without(owner: type, check: str) -> Generator[None]:
+def without(owner: type, check: str) -> AbstractContextManager[object]:
     """While it lasts, a kernel is not used.
 
     Args:
         owner: the class that uses it.
         check: its method that says whether the kernel takes something; it says no.
     """
-    before = getattr(owner, check)
-    setattr(owner, check, lambda *_: False)
-    try:
-        yield
-    finally:
-        setattr(owner, check, before)
+    return patch.object(owner, check, lambda *_: False)

@@ -14,7 +14,6 @@ processor time of both, which other work on the machine disturbs less. With `--t
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 from pathlib import Path
 
@@ -24,9 +23,8 @@ from benchmarks._timing import add_device_option, copy_bandwidth, interleaved, p
 from benchmarks.load import load_at_start
 from benchmarks.lookup_plot import plot
 from benchmarks.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
-from benchmarks.reporting import Row
+from benchmarks.reporting import Row, write_rows
 from hyperplanes.utilities.environment import environment
-from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["main"]
 
@@ -96,11 +94,10 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.threads:
         torch.set_num_threads(options.threads)
-    about = environment() | {"load": round(load_at_start(), 2)}
+    about, load = environment(), load_at_start()
     bandwidth = copy_bandwidth(128 if options.quick else 512, options.device)
-    about["copy_gigabytes_per_second"] = bandwidth / 1e9
     where = f"{about['processor']}, {about['threads']} threads" if options.device == "cpu" else about["gpu"]
-    title = f"{where}, commit {about['commit']}, load {about['load']:.1f}"
+    title = f"{where}, commit {about['commit']}, load {load:.1f}"
     print(f"{title}; a copy moves {bandwidth / 1e9:.1f} GB/s")
     repeats = 3 if options.quick else 15
     scene = Scene.make(*STANDARD, options.device)
@@ -113,9 +110,7 @@ def main(arguments: list[str]) -> int:
     print("\n" + table(swept, ["sweep", "planes", "points", "resolution", "way", "seconds", *COLUMNS[3:9]]))
     rows += swept
     if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        content = {"benchmark": "lookup", "device": options.device, **about, "rows": rows}
-        write_whole(options.json, (json.dumps(content, indent=1) + "\n").encode())
+        write_rows("lookup", rows, options.json, options.device, copy_gigabytes_per_second=bandwidth / 1e9)
     if options.plot:
         plot(rows, options.plot, title)
     return 0

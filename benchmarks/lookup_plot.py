@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks.lookup_ways import STANDARD
 from benchmarks.reporting import Row
+from hyperplanes.utilities.plots import new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,9 +31,7 @@ def plot(rows: list[Row], path: Path, title: str) -> None:
     Args:
         title: the machine, in words.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13, 8), layout="constrained")
+    figure = new_figure(13, 8)
     figure.suptitle(title, fontsize=11)
     grid = figure.add_gridspec(2, 3, height_ratios=[1.15, 1])
     _bars(figure.add_subplot(grid[0, :]), [row for row in rows if "sweep" not in row])
@@ -42,8 +41,7 @@ def plot(rows: list[Row], path: Path, title: str) -> None:
         _lines(shared, axis, [row for row in rows if row.get("sweep") == axis])
         if index == 0:
             shared.set_ylabel("milliseconds, both, forward")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def _bars(axes: Axes, rows: list[Row]) -> None:

@@ -15,6 +15,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.renderer import RayMarching
+from hyperplanes.utilities.plots import new_figure, save_figure
 
 __all__ = ["growth", "plot_growth"]
 
@@ -58,9 +59,7 @@ def growth(model: HyperPlanes, quick: bool) -> list[Row]:
 
 def plot_growth(rows: list[Row], path: Path) -> None:
     """Seconds of one view along each axis of `growth`, with a line of the slope that the samples asked for explain."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    figure = new_figure(11, 3.6)
     axes = figure.subplots(1, 3, sharey=True)
     labels = {"pixels": "pixels a side", "steps": "steps along the diameter", "planes": "ImagePlanes"}
     for where, (axis, label) in zip(axes, labels.items(), strict=True):
@@ -78,5 +77,4 @@ def plot_growth(rows: list[Row], path: Path) -> None:
         where.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("seconds")
     axes[0].legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)

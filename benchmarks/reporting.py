@@ -31,7 +31,8 @@ def finish(name: str, rows: list[Row], json_file: Path | None, device: str = "cp
     return 0
 
 
-def write_rows(name: str, rows: list[Row], json_file: Path, device: str = "cpu") -> None:
-    """Write rows with the commit and the hardware."""
-    content = {"benchmark": name, "device": device, **environment(), "load": round(load_at_start(), 2), "rows": rows}
+def write_rows(name: str, rows: list[Row], json_file: Path, device: str = "cpu", **about: object) -> None:
+    """Write rows with the commit and the hardware, and what else is to be known about them."""
+    machine = environment() | {"load": round(load_at_start(), 2)}
+    content = {"benchmark": name, "device": device, **machine, **about, "rows": rows}
     write_whole(json_file, (json.dumps(content, indent=2) + "\n").encode())

@@ -155,12 +155,11 @@ def _gpu(result: Result) -> str:
     for network, name in NETWORKS.items():
         for size in dict.fromkeys(each.split(", ")[1] for each in found if each.startswith(f"{network}, ")):
             default, one, paper = (found.get(f"{network}, {size}, {way}") for way in WAYS_TO_DRAW)
-            assert default is not None
-            assert one is not None
             times = [f"{way['milliseconds']:.0f} ms" if way else "-" for way in (default, one, paper)]
-            ratio = f"{paper['milliseconds'] / one['milliseconds']:.1f}" if paper else "-"
+            ratio = f"{paper['milliseconds'] / one['milliseconds']:.1f}" if one and paper else "-"
             quality = " / ".join(f"{way['psnr']:.2f}" if way else "-" for way in (default, one, paper))
-            lines.append([f"{name}, {size}", *times, ratio, quality, f"{default['peak_gib']:.1f} GiB"])
+            memory = f"{default['peak_gib']:.1f} GiB" if default else "-"
+            lines.append([f"{name}, {size}", *times, ratio, quality, memory])
     return markdown_table(["one view", *WAYS_TO_DRAW, "ratio", "PSNR in dB", "memory"], lines)
 
 
@@ -168,7 +167,7 @@ def _gpu_ways(result: Result) -> str:
     found: dict[str, dict[str, Result]] = {}
     for row in result["rows"]:
         network, size, way = row["name"].split(", ", 2) if row["name"].count(", ") == 2 else ("", "", "")
-        if size == "200x200" and way not in ("default", "paper's protocol"):
+        if size == "200x200" and way not in ("default", "paper's protocol") and "error" not in row:
             found.setdefault(way, {}).setdefault(network, row)
     lines = []
     for way, networks in found.items():
@@ -179,7 +178,7 @@ def _gpu_ways(result: Result) -> str:
 
 
 def _gpu_work(result: Result) -> str:
-    rows = [row for row in result["rows"] if "milliseconds" not in row]
+    rows = [row for row in result["rows"] if "milliseconds" not in row and "error" not in row]
     lines = [[row["name"], _seconds(row["seconds"]), f"{row['psnr']:.2f} dB" if "psnr" in row else ""] for row in rows]
     return markdown_table(["", "seconds", "PSNR"], lines)
 

@@ -23,6 +23,7 @@ from hyperplanes.configuration.presets import Preset, preset
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.training import Trainer
 from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.plots import new_figure, save_figure
 from hyperplanes.views import Task
 
 __all__ = ["main"]
@@ -147,9 +148,7 @@ def unseen_psnr(trained: Trainer, objects: Objects) -> float:
 
 def plot(rows: list[Row], path: Path) -> None:
     """The rows of `curves`, over steps and over seconds."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
+    figure = new_figure(10, 3.8)
     for axes, axis in zip(figure.subplots(1, 2, sharey=True), ("step", "seconds"), strict=True):
         for name, colour in (("packed", "#1a73e8"), ("dense", "#9aa0a6")):
             found = [row for row in rows if row["path"] == name]
@@ -159,5 +158,4 @@ def plot(rows: list[Row], path: Path) -> None:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, loc="lower right")
     figure.axes[0].set_ylabel("PSNR of unseen objects, dB")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)

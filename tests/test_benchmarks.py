@@ -294,6 +294,22 @@ def test_a_table_has_the_numbers_of_its_rows_and_the_load_they_were_measured_wit
             tables.fill(f"<!-- benchmarks {name} -->\n<!-- end -->", tmp_path)
 
 
+def test_ways_to_draw_that_do_not_work_leave_their_cells_empty(tmp_path):
+    drawn = {"milliseconds": 2.0, "psnr": 30.0, "peak_gib": 1.5}
+    ways = ["one ray a pixel", "paper's protocol", "no TF32"]
+    rows = [{"name": f"small, 200x200, {way}", **drawn} for way in ways]
+    rows += [{"name": f"small, 200x200, {way}", "error": "RuntimeError"} for way in ("default", "one CUDA graph")]
+    result = {"benchmark": "gpu", "device": "cuda", "gpu": "a GPU", "torch": "2", "commit": "abc1234", "rows": rows}
+    (tmp_path / "gpu.json").write_text(json.dumps(result))
+    found = {
+        name: tables.fill(f"<!-- benchmarks {name} -->\n<!-- end -->", tmp_path)
+        for name in ("gpu", "gpu_ways", "gpu_work")
+    }
+    assert "200x200 | - | 2 ms | 2 ms | 1.0 | - / 30.00 / 30.00 | - |" in found["gpu"]
+    assert "| no TF32 | - | 2.0 ms, 30.00 dB |" in found["gpu_ways"]
+    assert not any("CUDA graph" in text for text in found.values())
+
+
 def test_tables_of_views_take_the_rows_of_all_suites(tmp_path):
     """By hand: two suites of one object name; a number of views that only one of them was measured with."""
     machine = {"benchmark": "views", "commit": "abc1234"}

@@ -337,6 +337,10 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
                 (["evaluate", "--data", "example-car", "--method", "nearest_view"], "the layout posed"),
             )
         ),
+        *(
+            (["capture", "DATA", "--out", "OUT/x", *option.split()], [f"{option.split()[0]}: expected a whole number"])
+            for option in ("--size 63", "--size 100000", "--frames 2")
+        ),
         (["inspect", "OUT/none"], ["OUT/none: expected a data set, posed images, a checkpoint", "found nothing"]),
     ],
 )
@@ -820,9 +824,10 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, monkeypatch, ca
     assert main(["inspect", str(out)]) == 0
     assert "of 32^3 voxels" in capsys.readouterr().out
     capsys.readouterr()
-    assert main(["render", "--checkpoint", str(out), *scene, "--steps", "3"]) == 2
-    assert "steps: expected 0 with a baked file" in complaint(capsys)
+    monkeypatch.setattr("hyperplanes.commands.scene.read_scene", None)  # refused before pictures are read
+    adapting = (["--steps", "3"], ["--refine-poses"], ["--learn-background"])
     for verb, *option in (
+        *([verb, *option] for verb in ("render", "export") for option in adapting),
         *(["render", "--protocol", "paper"], ["render", "--fine-tune", "hypernetwork"], ["render", "--no-reflections"]),
         *(["render", "--representation", "field"], ["export", "--page-voxels", "32", "--what", "page"]),
         *(["export", "--fit", "3", "--what", what] for what in ("page", "turntable")),
@@ -950,9 +955,9 @@ def test_a_single_scene_is_evaluated_with_the_way_up_that_its_cameras_tell(tmp_p
 
     capsys.readouterr()
     expected = quality(scene)
-    assert "up: y, as the cameras are held; --up says otherwise" in capsys.readouterr().out
+    assert "up: y, from how the cameras are held; --up overrides it" in capsys.readouterr().out
     assert quality(turned) == pytest.approx(expected, abs=1e-2)
-    assert "up: z, as the cameras are held; --up says otherwise" in capsys.readouterr().out
+    assert "up: z, from how the cameras are held; --up overrides it" in capsys.readouterr().out
     assert quality(turned, "--up", "0,0,2") == pytest.approx(expected, abs=1e-2)
     assert quality(turned, "--up", "-z") == quality(turned, "--up=-z") < expected - 0.1
     assert abs(quality(turned, "--up", "y") - expected) > 0.1
@@ -972,7 +977,7 @@ def test_photographs_with_a_background_are_warned_about_and_ways_up_are_said(tmp
     command = ["render", "--checkpoint", str(demo_folder()), "--views", str(scene), "--out", str(tmp_path / "out")]
     assert main(command) == 0
     shown = capsys.readouterr()
-    assert "up: y, as the cameras are held; --up says otherwise" in shown.out
+    assert "up: y, from how the cameras are held; --up overrides it" in shown.out
     assert "rendering 6/6" in shown.out
     assert "the views have no alpha and no masks" in shown.err
     assert re.search("worse than copying the nearest view: .*; cut the object out first", shown.err)

@@ -86,12 +86,11 @@ def find_photographs(folder: Path) -> list[Path]:
     home = photographs_folder(folder)
     files = [] if home is None else [p for p in home.iterdir() if p.is_file() and not p.name.startswith(".")]
     heif = [path for path in files if path.suffix.lower() in HEIF_SUFFIXES]
-    found = sorted((path for path in files if path.suffix.lower() in PICTURE_SUFFIXES), key=_natural)
     if heif and not _reads_heif():
         raise DataError(
             heif[0], "JPEG, PNG, WebP or TIFF", "HEIC", "pip install pillow-heif, or have the phone save JPEG"
         )
-    found = sorted(found + heif, key=_natural)
+    found = sorted(heif + [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES], key=_natural)
     if len(found) < FEWEST:
         count = f"{len(found)} photographs" if len(found) != 1 else "1 photograph"
         raise DataError(folder, f"at least {FEWEST} photographs of one object", count, _elsewhere(folder))
@@ -203,7 +202,7 @@ def read_upright(
 
 
 def scaled_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
-    """(height, width) scaled down so that the longer side has so many pixels at most.
+    """(height, width) scaled down so that the longer side has at most `max_size` pixels.
 
     >>> scaled_size((3000, 4000), 1000)
     (750, 1000)
@@ -230,7 +229,7 @@ def _with_one_shape(photographs: list[Photograph]) -> list[Photograph]:
 
 def _natural(path: Path) -> list[Any]:
     """A key by which numbers in names sort as numbers."""
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", path.name.lower()) if part]
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", path.name.lower()) if part]
 
 
 def _reads_heif() -> bool:

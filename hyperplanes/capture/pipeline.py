@@ -221,14 +221,16 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
     folder = work.stages.folder / "poses"
     done = work.stages.begin("poses", key)
     if done is not None:
+        work.notes += done.get("notes", [])
         return SparseModel.load(folder / "model.npz")
+    notes = list[str]()
     best: SparseModel | None = None
     for number, features in enumerate(ATTEMPTS):
         count = 0 if best is None else len(best)
         if number and count >= features.below * len(pictures):
             break
         if number:
-            work.notes.append(f"{count} of {len(pictures)} photographs posed: tried again with {features.name}")
+            notes.append(f"{count} of {len(pictures)} photographs posed: tried again with {features.name}")
         found = find_poses(
             pictures,
             shown,
@@ -247,13 +249,14 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
             ADVICE,
         )
     if len(best) < ENOUGH * len(pictures):
-        work.notes.append(f"few photographs could be posed; for the next time: {ADVICE}")
+        notes.append(f"few photographs could be posed; for the next time: {ADVICE}")
     best.save(folder / "model.npz")
     for database in folder.glob("*.db*"):
         database.unlink()
     for models in folder.glob("*.models"):
         shutil.rmtree(models)
-    work.stages.finish("poses", key, {"count": len(best), "error": best.reprojection_error})
+    work.stages.finish("poses", key, {"count": len(best), "error": best.reprojection_error, "notes": notes})
+    work.notes += notes
     return best
 
 

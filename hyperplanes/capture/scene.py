@@ -17,7 +17,7 @@ from hyperplanes.utilities.encoding import encode_ply
 from hyperplanes.utilities.files import DataError, read_json
 from hyperplanes.utilities.writing import write_json, write_whole
 
-__all__ = ["Captured", "encode_points", "straightened", "write_scene"]
+__all__ = ["Captured", "straightened", "write_scene"]
 
 POINTS = "sparse_pc.ply"
 STRAIGHT = 0.25  # pixels that a lens may move a corner by without being taken out
@@ -98,7 +98,7 @@ def write_scene(
             (folder / name).unlink()
     for name, data in files.items():
         write_whole(folder / name, data, durable=False)
-    write_whole(folder / POINTS, encode_points(model), durable=False)
+    write_whole(folder / POINTS, encode_ply(model.points, model.colours), durable=False)
     world_from_camera = np.linalg.inv(model.camera_from_world)
     paths = [f"images/{name}.jpg" for name in names]
     document = transforms_document(
@@ -122,8 +122,3 @@ def _listed(document: Path) -> set[str]:
     entries = [each for each in frames if isinstance(each, dict)] if isinstance(frames, list) else []
     names = [str(each[key]) for each in entries for key in ("file_path", "mask_path") if key in each]
     return {name for name in names if re.fullmatch(r"(images|masks)/[^/\\]+", name)}
-
-
-def encode_points(model: SparseModel) -> bytes:
-    """The points with their colours as binary PLY."""
-    return encode_ply(model.points, model.colours)

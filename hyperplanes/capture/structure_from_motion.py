@@ -274,5 +274,5 @@ def _quiet(pycolmap: Any) -> Generator[None]:
 
 
 def _threads() -> int:
-    """Threads for COLMAP: as many as OMP_NUM_THREADS allows, else all cores."""
+    """Threads for COLMAP: as many as OMP_NUM_THREADS allows, otherwise all cores."""
     return stated_threads() or -1

@@ -46,7 +46,7 @@ VERBS: dict[str, str] = {
     "bake": "one object as a small file of voxels that renders at once, without any network",
     "adapt": "write the weights of one object, to be rendered later without the hypernetwork",
     "presets": "list the named configurations",
-    "doctor": "say what works on this machine, and how to mend what does not",
+    "doctor": "say what works on this machine, and how to fix what does not",
 }
 """The verbs of this package with one line about each, in the order of the overview."""
 

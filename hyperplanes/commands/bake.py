@@ -38,7 +38,7 @@ class Arguments(ObjectArguments):
     Attributes:
         voxels: Along each side of the grid; 1.4 for every pixel of the images, and at most 256, when not given.
         fit: Gradient steps that fit the voxels to the shown views; 0 keeps what the field shows.
-        orbit: Also write a turntable of so many frames beside the file, rendered from the voxels.
+        orbit: Also write a turntable of this many frames beside the file, rendered from the voxels.
         size: Pixels along the longer side of the turntable; as the images when not given.
         turntable: The format of the turntable; mp4 and webm need `pip install 'hyperplanes[video]'`.
     """

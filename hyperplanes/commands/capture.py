@@ -1,6 +1,6 @@
 """Turn photographs or a video of an object into a scene that the other verbs read: camera poses, masks, what is up.
 
-Needs the extra `photos`: pip install 'hyperplanes[photos]'. What was interrupted goes on where it was.
+Needs the extra `photos`: pip install 'hyperplanes[photos]'. An interrupted capture resumes where it stopped.
 
 Example:
     hyperplanes capture photos/ --out scene
@@ -48,18 +48,14 @@ class Arguments:
     photographs: tyro.conf.Positional[Path]
     out: Path
     mask: Annotated[str, tyro.conf.arg(metavar="{auto,given,colour,network,grabcut,none,COMMAND}")] = "auto"
-    size: int = 1000
+    size: Annotated[int, range(64, 1 << 16)] = 1000
     order: Literal["auto", "sequence", "any"] = "auto"
-    frames: int = 60
+    frames: Annotated[int, range(3, 1 << 16)] = 60
 
 
 @writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Find poses and masks, write the scene, say what was found and what was left out."""
-    if arguments.size < 64:
-        raise ValueError(f"--size: expected at least 64 pixels, got {arguments.size}")
-    if arguments.frames < 3:
-        raise ValueError(f"--frames: expected at least 3, got {arguments.frames}")
     from hyperplanes.capture import Settings, capture
 
     console, started = Console(), time.perf_counter()

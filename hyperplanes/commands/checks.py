@@ -1,4 +1,4 @@
-"""What works on this machine: tried, not guessed, and each trouble with what mends it."""
+"""What works on this machine: tried, not guessed, and each problem with what fixes it."""
 
 from __future__ import annotations
 

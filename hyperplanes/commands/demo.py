@@ -98,7 +98,7 @@ def settings_of(arguments: Arguments) -> DemoSettings:
             f"got {arguments.held_out} and {arguments.objects}"
         )
     if arguments.resolution < 16:
-        raise ValueError(f"resolution: expected at least 16 pixels, got {arguments.resolution}")
+        raise ValueError(f"--resolution: expected at least 16 pixels, got {arguments.resolution}")
     given = {each.name for each in fields(DemoSettings)} & {each.name for each in fields(Arguments)}
     return DemoSettings(**{name: getattr(arguments, name) for name in given})
 

@@ -27,7 +27,7 @@ class Arguments:
 def line(check: Check) -> str:
     """One check for people."""
     mark = "ok    " if check.works else ("BROKEN" if check.needed else "-     ")
-    remedy = "" if check.works or not check.remedy else f"; to mend it: {check.remedy}"
+    remedy = "" if check.works or not check.remedy else f"; to fix it: {check.remedy}"
     return f"{mark}  {check.name:<26}{check.detail}{remedy}"
 
 

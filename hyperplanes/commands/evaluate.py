@@ -67,18 +67,19 @@ class Arguments:
         markdown: Write the tables of methods and of their pairs here.
         grid: Draw the truth beside every method's picture here: a view of each of the first objects (PNG, SVG or PDF).
         boxes: Draw the objects' PSNR here, a box a method.
-        steps: Evaluate methods after so many fine-tuning steps, each number a row; 0 is the method itself.
+        steps: Evaluate methods after N fine-tuning steps, a row for each number; 0 is the method itself.
         curve: Draw PSNR over --steps into this file.
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
         seeds: How many seeds.
         lpips: Measure LPIPS with these weights, a safetensors file that `hyperplanes.evaluation.perceptual` describes.
         split: Which objects.
-        objects: Only the first so many.
+        objects: Evaluate only the first N objects.
         support: Support views an object; more than the data set has are taken from its query views, and those are
             compared although they were shown, which a warning says.
         preset: The shape of fields that need no checkpoint.
         up: The direction that points up in the data's world: an axis such as y or -z, three numbers such as 0,0.1,1, or
-            auto: of a single scene as its cameras are held; of a data set as its files say, else y as in training data.
+            auto: of a single scene, from how its cameras are held; of a data set, as its files say, otherwise y as in
+            training data.
         protocol: How fields are sampled: as they were trained, 64 + 128 times a ray as in the paper, or by
             ray marching through what is not empty.
         legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.
@@ -259,7 +260,7 @@ def _of_seeds(arguments: Arguments) -> str:
 
 
 def _of_shown(scores: Sequence[Score]) -> str:
-    """A sentence where methods are judged by views that they were shown, else nothing."""
+    """A sentence where methods are judged by views that they were shown, otherwise nothing."""
     shown = [int(each.query_views_shown) for each in scores[0].objects if each.query_views_shown]
     if not shown:
         return ""

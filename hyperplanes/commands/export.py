@@ -120,6 +120,9 @@ def run(arguments: Arguments) -> int:
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     given = {
+        "--steps": arguments.steps != 0,
+        "--learn-background": arguments.learn_background,
+        "--refine-poses": arguments.refine_poses,
         "--page-voxels": arguments.page_voxels is not None,
         "--no-reflections": arguments.no_reflections,
         # splats are fitted, whatever their voxels come from
@@ -251,8 +254,8 @@ def _write_mesh(
     found = agreement(surface, solid, query.cameras)
     console.say(
         f"{path}: its silhouettes overlap the rendered ones of {len(query)} {_judges(arguments)} views by "
-        f"{found.overlap:.1%} (intersection over union), and {found.depth:.1%} of what both cover is as far away; cut "
-        f"at density {level:.3g}"
+        f"{found.overlap:.1%} (intersection over union), and the depths agree on {found.depth:.1%} of the pixels that "
+        f"both cover; density at the surface: {level:.3g}"
     )
     more = ", or --steps 100" if adaptable else ""
     if found.overlap < GOOD_OVERLAP:

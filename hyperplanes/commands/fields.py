@@ -111,9 +111,6 @@ def adapt_to(
 
     Returns:
         The field, and what was warned about before.
-
-    Raises:
-        ValueError: fine-tuning steps of a baked scene.
     """
     from hyperplanes.adaptation.kept import keep_field, kept_folder, recall_field
     from hyperplanes.adaptation.rotation import RotatedField
@@ -123,10 +120,6 @@ def adapt_to(
     from hyperplanes.export.baking import BakedScene
 
     if isinstance(source, BakedScene):
-        if steps != 0:
-            raise ValueError(
-                f"steps: expected 0 with a baked file, which is finished, got {steps}; fine-tune, then bake"
-            )
         console.say(f"{len(source.field.values):,} baked voxels, shown from the poses of {name}")
         return source, []
     warned = suitability_warnings(source, shown, steps)

@@ -47,7 +47,7 @@ Free = Literal["weights", "hypernetwork"]
 """What fine-tuning optimises."""
 
 ViewsUp = Annotated[str, tyro.conf.arg(metavar="{auto,y,z,x,-y,-z,-x}")]
-"""The axis that points up in the world of photographs, three numbers, or auto: as the cameras are held."""
+"""The axis that points up in the world of photographs, three numbers, or auto: from how the cameras are held."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ class ViewsArguments:
             are shown better by half a decibel: for poses that are a little wrong.
         no_reflections: Do not show the model the mirror images of the views of an object that looks symmetric.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
-            0,0.1,1, or auto: as the cameras are held. Meshes, turntables and baked files have y up.
+            0,0.1,1, or auto: from how the cameras are held. Meshes, turntables and baked files have y up.
         downscale: Reduce the images by this factor, averaging pixels. When not given, images of more than a megapixel
             are reduced to at most one.
         device: auto, cpu or cuda.

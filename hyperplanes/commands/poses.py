@@ -15,16 +15,15 @@ if TYPE_CHECKING:
 
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.console import Console
-    from hyperplanes.export.baking import BakedScene
     from hyperplanes.views import Task, Views
 
 __all__ = ["refine_task"]
 
-JUDGED = 128  # pixels along the longer side of the pictures on which poses are compared
+JUDGED = 128  # pixels along the longer side of the views that are shown to compare poses
 LEAST_GAIN = 0.5  # decibels; four views say no more, and right poses become a little worse
 
 
-def refine_task(source: HyperPlanes | BakedScene, task: Task, console: Console, *, all_views: bool = False) -> Task:
+def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views: bool = False) -> Task:
     """The views with refined poses, or as they are where a field of the refined ones shows left-out views no better.
 
     Support and query are refined together; only support views decide which poses are taken. What was found is kept
@@ -36,16 +35,13 @@ def refine_task(source: HyperPlanes | BakedScene, task: Task, console: Console, 
         console: where it is said.
         all_views: both are the same.
 
-    Raises:
-        ValueError: a baked scene, which adapts to nothing, or too few views.
+    Too few views are a ValueError.
     """
     from hyperplanes.adaptation.kept import keep_tensors, kept_file, recall_tensors
-    from hyperplanes.export.baking import BakedScene
+    from hyperplanes.evaluation.suitability import HELD_OUT_SIZE
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.views import Task, join_views
 
-    if isinstance(source, BakedScene):
-        raise ValueError("--refine-poses: expected a model that adapts to the views, got a baked file")
     count, started = len(task.support), time.perf_counter()
     views = task.support if all_views else join_views(task.support, task.query)
     file = kept_file("poses", views, source, count)
@@ -56,7 +52,8 @@ def refine_task(source: HyperPlanes | BakedScene, task: Task, console: Console, 
         how = format_duration(time.perf_counter() - started)
         keep_if_possible(file, partial(keep_tensors, file, found), console)
     before, after = found["psnr"].tolist()
-    figures = f"support views left out have {after:.2f} dB with them, {before:.2f} as given (64 pixels); {how}"
+    figures = f"support views left out have {after:.2f} dB with them, {before:.2f} as given"
+    figures += f" ({HELD_OUT_SIZE} pixels); {how}"
     if after < before + LEAST_GAIN:
         console.say(f"poses: as given, refined ones are not better by {LEAST_GAIN:g} dB: {figures}")
         return task

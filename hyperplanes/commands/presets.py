@@ -63,7 +63,7 @@ def run(arguments: Arguments) -> int:
 
     console = Console()
     if arguments.name is not None:
-        console.say(document("hyperplanes", preset(arguments.name).by_method("hyperplanes")).rstrip())
+        console.say(document(preset(arguments.name)).rstrip())
         return 0
     console.table(HEADINGS, [row(name, each) for name, each in PRESETS.items()])
     console.say("")

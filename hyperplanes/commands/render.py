@@ -56,7 +56,7 @@ class Arguments(ObjectArguments):
 
     Attributes:
         fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
-        orbit: So many pictures evenly around the object, and a turntable, instead of the query poses.
+        orbit: This many pictures evenly around the object, and a turntable, instead of the query poses.
         camera_path: A JSON of nerfstudio's viewer or Blender add-on: the pictures of its frames, and an animation.
         dataparser_transforms: nerfstudio's dataparser_transforms.json, where the path was made in its viewer: from the
             world of the views to that of the path.
@@ -67,7 +67,7 @@ class Arguments(ObjectArguments):
         turntable: The format of the animation; mp4 and webm need `pip install 'hyperplanes[video]'`.
         representation: What draws the pictures: the field itself, or voxels that are baked from it and fitted to the
             shown views, which takes half a minute once and milliseconds a picture. auto takes voxels for an orbit or
-            a path of so many pictures that they are drawn sooner so, where 16 views or more are shown.
+            a path of enough pictures for this to be faster, where 16 views or more are shown.
         residuals: Add to the pictures what the field lacks where the shown views see the same places. All shown views
             are rendered for that first. auto: where the model does so, `small` from 10 views on, unless they are large.
         protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
@@ -122,6 +122,9 @@ def run(arguments: Arguments) -> int:
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     given = {
+        "--steps": arguments.steps != 0,
+        "--learn-background": arguments.learn_background,
+        "--refine-poses": arguments.refine_poses,
         "--protocol": arguments.protocol != "default",
         "--fine-tune": arguments.fine_tune != "weights",
         "--no-reflections": arguments.no_reflections,

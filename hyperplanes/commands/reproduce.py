@@ -16,7 +16,7 @@ Example:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,21 +72,22 @@ class Arguments:
     device: str = "auto"
 
 
-def data_sets(given: Sequence[str]) -> dict[str, Path]:
+def data_sets(given: Sequence[str], classes: Collection[str]) -> dict[str, Path]:
     """Folders by class.
 
-    Raises:
-        ValueError: not of the form CLASS=FOLDER, or another class.
-    """
-    from hyperplanes.experiments.tables import CLASSES
+    Args:
+        given: of the form CLASS=FOLDER.
+        classes: those that there are.
 
-    found = {}
+    Raises:
+        ValueError: not of that form, another class, or one class twice.
+    """
+    found: dict[str, Path] = {}
     for each in given:
-        name, equals, folder = each.partition("=")
-        if not equals or name not in CLASSES.values():
-            raise ValueError(
-                f"--data: expected CLASS=FOLDER with a class of {', '.join(CLASSES.values())}, got {each!r}"
-            )
+        name, _, folder = each.partition("=")
+        if not folder or name not in classes or name in found:
+            known = ", ".join(classes)
+            raise ValueError(f"--data: expected CLASS=FOLDER, each of the classes {known} once, got {each!r}")
         found[name] = Path(folder)
     return found
 
@@ -98,6 +99,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
     from hyperplanes.experiments.estimate import estimate
     from hyperplanes.experiments.figures import curves_of, figure_of, pictures_of
+    from hyperplanes.experiments.tables import CLASSES
     from hyperplanes.experiments.workspace import Workspace
     from hyperplanes.utilities.formatting import format_duration
     from hyperplanes.utilities.plots import save_figure
@@ -105,7 +107,8 @@ def run(arguments: Arguments) -> int:
 
     console = Console()
     scale = SCALES[arguments.scale]
-    experiment = scale.applied(find_experiment(arguments.name)).of(arguments.only)
+    table = scale.applied(find_experiment(arguments.name))
+    experiment = table.of(arguments.only)
     seeds = scale.seeds(experiment) if arguments.seeds is None else arguments.seeds
     if seeds < 1:
         raise ValueError(f"--seeds: expected at least 1, got {seeds}")
@@ -113,7 +116,8 @@ def run(arguments: Arguments) -> int:
     def found(cell: Cell, seed: int, score: ObjectScore, *_: int) -> None:
         console.say(f"{cell.row}, {cell.column}, seed {seed}: {score.name} {score.psnr:.2f} dB")
 
-    device, given, legacy = arguments.device, data_sets(arguments.data), arguments.legacy
+    given = data_sets(arguments.data, dict.fromkeys([*CLASSES.values(), *table.classes]))
+    device, legacy = arguments.device, arguments.legacy
     workers = make_workers(arguments.workers, arguments.out, scale, device, given=given, legacy=legacy)
     runner = make_runner(
         Workspace(arguments.out),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -52,19 +53,15 @@ def prepare_task(
         source: what will adapt to them.
         console: where it is said.
         all_views: both are the same.
-
-    Raises:
-        ValueError: a baked file, which adapts to nothing, and an option that is for adapting.
     """
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.background import cut_out_task
     from hyperplanes.commands.poses import refine_task
-    from hyperplanes.export.baking import BakedScene
 
     if arguments.learn_background:
-        if isinstance(source, BakedScene):
-            raise ValueError("--learn-background: expected a model that adapts to the views, got a baked file")
         task = cut_out_task(task, console, all_views=all_views)
     if arguments.refine_poses:
+        assert isinstance(source, HyperPlanes)
         task = refine_task(source, task, console, all_views=all_views)
     return task
 
@@ -80,14 +77,14 @@ def read_scene(
         path: of the posed images, or the name of a scene that comes with the package.
         console: where it is said.
         all_views: whether all are shown.
-        up: the direction that points up in their world, as in `y_up_from`, or auto: as the cameras are held.
+        up: the direction that points up in their world, as in `y_up_from`, or auto: from how the cameras are held.
         downscale: as in `read_views`.
 
     Returns:
         Views of a world with y up, and the direction that was up before.
     """
     from hyperplanes.data.dataset import locate_scene
-    from hyperplanes.data.formats.recognise import read_posed, read_posed_task
+    from hyperplanes.data.formats.recognise import read_posed, read_posed_task, scene_name
     from hyperplanes.data.upright import upright_task
     from hyperplanes.utilities.files import malformed
     from hyperplanes.views import Task
@@ -97,7 +94,7 @@ def read_scene(
         if all_views:
             scene = read_posed(path, downscale)
             views, notes = scene.views(), scene.notes
-            task = Task(views, views, path.resolve().name)
+            task = Task(views, views, scene_name(path))
         else:
             posed = read_posed_task(path, downscale)
             task, notes = posed.task(), posed.notes
@@ -133,7 +130,7 @@ def read_path(
 
     listed = locate_scene(scene)
     listed = listed if listed.is_file() else listed / "transforms.json"
-    document = read_json(listed) if listed.is_file() else None
+    document = read_json(listed) if listed.suffix == ".json" and listed.is_file() else None
     found = read_camera_path(path, transforms, document)
     cameras = upright_cameras(found.cameras, up)
     away = (camera.centres(cameras) - cameras.extrinsics.new_tensor(shown.bounds.centre)).norm(dim=1)
@@ -176,16 +173,12 @@ def _is_seen(bounds: Sphere, cameras: PinholeCamera) -> bool:
     angle = torch.acos(((away * camera.viewing_directions(cameras)).sum(-1) / distance).clamp(-1, 1))
     radius = torch.asin((bounds.radius / distance).clamp_max(1.0))
     height, width = camera.image_size(cameras)
-    cone = torch.atan(
-        torch.tensor(float(height), dtype=angle.dtype).hypot(angle.new_tensor(float(width)))
-        / 2
-        / camera.intrinsics(cameras)[:, 0, 0]
-    )
+    cone = torch.atan(math.hypot(height, width) / 2 / camera.intrinsics(cameras)[:, 0, 0])
     return bool(((angle < cone + radius) | (distance < bounds.radius)).any())
 
 
 def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
-    """The direction that is up in the world of one scene: as stated, as its cameras are held, or y.
+    """The direction that is up in the world of one scene: as stated, from how its cameras are held, or y.
 
     Args:
         parts: of the scene.
@@ -195,13 +188,13 @@ def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
     from hyperplanes.geometry import cameras as camera
 
     if (stated := parts[0].up) is not None:
-        console.say(f"up: {stated}, as the files say; --up says otherwise")
+        console.say(f"up: {stated}, as the files say; --up overrides it")
         return stated
     guessed = guess_up(camera.concatenate([part.cameras for part in parts]))
     console.say(
-        f"up: {guessed}, as the cameras are held; --up says otherwise"
+        f"up: {guessed}, from how the cameras are held; --up overrides it"
         if guessed
-        else "up: y; the cameras do not tell, --up says otherwise"
+        else "up: y, as the cameras do not tell; --up overrides it"
     )
     return guessed or "y"
 

@@ -1,9 +1,9 @@
 """Train a model on a data set; what `generate` writes, or any other layout that `inspect` can read.
 
 The model is evaluated on held-out objects at intervals. Checkpoints are written to --out on the way; interrupted, the
-same command goes on from the last one. Pressing Ctrl-C once stops after a checkpoint, twice at once; SIGTERM, as a
-cluster sends it, stops after a checkpoint too. Beside the weights lie config.yaml, which --config takes, curve.csv, and
-samples/ with held-out views beside the truth; best/ holds the model that was best on held-out objects.
+same command goes on from the last one. Ctrl-C stops after a checkpoint; a second Ctrl-C stops immediately.
+SIGTERM, as a cluster sends it, stops after a checkpoint too. Beside the weights lie config.yaml, which --config takes,
+curve.csv, and samples/ with held-out views beside the truth; best/ holds the model that was best on held-out objects.
 
 With --devices N, N processes of this machine share the objects of every step, one a GPU; --nodes M takes as many on
 each of M machines. Started by torchrun, it takes the processes that torchrun has started.
@@ -190,8 +190,8 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
         raise heard[0](advice) if heard else KeyboardInterrupt(advice)
 
 
-def resolve(arguments: Arguments) -> tuple[str, Preset]:
-    """The method, the model and its training: the preset's, changed by the file, by the options, by the settings.
+def resolve(arguments: Arguments) -> Preset:
+    """The model and its training: the preset's, changed by the file, by the options, by the settings.
 
     Raises:
         ValueError: an unknown name, or a value that does not fit; the message names the file or the option.
@@ -245,7 +245,7 @@ def resolve(arguments: Arguments) -> tuple[str, Preset]:
         with prefix_errors("--support"):
             network = replace(chosen.model.network, planes=arguments.support)
         chosen = replace(chosen, model=replace(chosen.model, network=network))
-    return chosen.model.method, chosen
+    return chosen
 
 
 def _is_first(arguments: Arguments) -> bool:
@@ -281,7 +281,8 @@ def _run(arguments: Arguments) -> int:
         raise ValueError(f"--out: expected a folder of its own, got {arguments.out}, which is --data; name another one")
     first = _is_first(arguments)
     console = Console(silent=not first)
-    method, chosen = resolve(arguments)
+    chosen = resolve(arguments)
+    method = chosen.model.method
     data = open_datasets(arguments.data, chosen.training.memory, legacy=arguments.legacy)
     shown = " ".join(map(str, arguments.data))
     for line in data.skipped:
@@ -308,7 +309,7 @@ def _run(arguments: Arguments) -> int:
     with launched(*processes, choose_device(arguments.device)) as device:
         trainer = start_training(chosen.model, chosen.training, tasks, arguments.out, device, reference)
         if first:
-            write_experiment(arguments.out / "config.yaml", method, chosen)
+            write_experiment(arguments.out / "config.yaml", chosen)
         shared = f", shared by {trainer.processes.count} processes" if trainer.processes.count > 1 else ""
         console.say(
             f"{method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "

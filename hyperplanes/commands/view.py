@@ -81,10 +81,14 @@ def run(arguments: Arguments) -> int:
     )  # viser's, of visitors who left
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
-    if not arguments.compare:
-        given = {"--no-reflections": arguments.no_reflections, "--fit": arguments.fit != Arguments.fit}
-        refuse_of_baked(source, given)
-    refuse_of_baked(source, {"--steps": arguments.steps != 0})
+    given = {
+        "--steps": arguments.steps != 0,
+        "--learn-background": arguments.learn_background,
+        "--refine-poses": arguments.refine_poses,
+        "--no-reflections": arguments.no_reflections and not arguments.compare,
+        "--fit": arguments.fit != Arguments.fit and not arguments.compare,
+    }
+    refuse_of_baked(source, given)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
     shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
@@ -121,12 +125,13 @@ def run(arguments: Arguments) -> int:
 
 def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
     """The methods to compare with, by name."""
-    from hyperplanes.adaptation.checkpoints import find_checkpoint
+    from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
     from hyperplanes.methods import Request, make_method
 
     if not arguments.compare:
         return {}
-    checkpoints = {"hyperplanes": find_checkpoint(arguments.checkpoint)} if not arguments.checkpoint.is_file() else {}
+    model = arguments.checkpoint
+    checkpoints = {} if model.is_file() else find_checkpoints([model]) | {"hyperplanes": find_checkpoint(model)}
     reflections = not arguments.no_reflections
     return {
         name: make_method(Request(name, checkpoints, device=device, reflections=reflections))
@@ -149,7 +154,7 @@ def _show_others(
 ) -> None:
     """Shows the other methods one after the other.
 
-    Of one that does not take so few views it is said why.
+    Where one does not take so few views, the reason is said.
     """
     for name, adapter in others.items():
         _check(wanted)

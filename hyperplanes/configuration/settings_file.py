@@ -79,14 +79,14 @@ def read_experiment(path: Path) -> dict[str, Any]:
     return value
 
 
-def write_experiment(path: Path, method: str, chosen: Preset) -> None:
+def write_experiment(path: Path, chosen: Preset) -> None:
     """Write a file from which `read_experiment` and `changed` make the same model and training."""
-    write_whole(path, document(method, chosen).encode())
+    write_whole(path, document(chosen).encode())
 
 
-def document(method: str, chosen: Preset) -> str:
+def document(chosen: Preset) -> str:
     """The YAML of a configuration, every entry of it."""
-    entries = {"method": method, "model": chosen.model.as_json(), "training": asdict(chosen.training)}
+    entries = {"method": chosen.model.method, "model": chosen.model.as_json(), "training": asdict(chosen.training)}
     return yaml.safe_dump(entries, sort_keys=False)
 
 

@@ -99,8 +99,12 @@ def read_camera_path(
     matrices[:, :2, 2] = (width - 1) / 2, (height - 1) / 2
     world = torch.from_numpy(opencv_from_opengl(poses)).float()
     cameras = camera.pinhole(torch.from_numpy(matrices).float(), world, height, width)
-    left_out = {"crop": "its crop", "render_time": "its times"}
-    notes = tuple(f"{what} is left out" for name, what in left_out.items() if name in document or name in frames[0])
+    left_out = {"crop": "its crop is", "render_time": "its times are"}
+    notes = tuple(
+        f"{what} left out"
+        for name, what in left_out.items()
+        if document.get(name) is not None or frames[0].get(name) is not None
+    )
     seconds = len(frames) / 24.0 if "seconds" not in document else _number(document, "seconds", path, "a time")
     return CameraPath(cameras, seconds, notes)
 
@@ -131,7 +135,7 @@ def _to_data(poses: npt.NDArray[np.float64], path: Path, scene: Mapping[str, Any
     applied = scene.get("applied_transform")
     if applied is not None:
         original = original @ np.linalg.inv(check_pose(applied, "transforms.json", "applied_transform"))
-        scale /= _number({"applied_scale": 1.0, **scene}, "applied_scale", path, "a factor")
+    scale /= _number({"applied_scale": 1.0, **scene}, "applied_scale", path, "a factor")
     moved = poses.copy()
     moved[:, :3, 3] /= scale
     return np.linalg.inv(original) @ moved

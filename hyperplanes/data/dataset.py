@@ -235,11 +235,12 @@ def read_views(path: str | Path, downscale: int | None = None, *, up: str | None
         path: a transforms*.json, or a folder that holds some, an SRN object's folder, a COLMAP model, a scene in the
             layout of LLFF, IDR or NSVF, or the .npz of one object. Of a folder with transforms_train, _val and _test
             files, all are read. "example-car" comes with the package.
-        downscale: take the mean of so many by so many pixels; None: photographs of more than a megapixel get as many
-            as leave one at most.
+        downscale: reduce the images by this factor, averaging pixels; None reduces photographs of more than a megapixel
+            to at most one.
         up: the direction that points up in the world of the files, which is turned so that it is y, as models expect:
-            an axis such as "z" or "-y", three numbers such as "0,0.1,1", or "auto": as the cameras are held, y where
-            they do not tell. None leaves the world as it is, which is right where y is up, as `generate` writes it.
+            an axis such as "z" or "-y", three numbers such as "0,0.1,1", or "auto": from how the cameras are held, y
+            where they do not tell. None leaves the world as it is, which is right where y is up, as `generate` writes
+            it.
 
     Returns:
         The views in the order of the files; masks where the files have alpha. Where pictures were left out, turned or
@@ -271,7 +272,7 @@ def read_task(path: str | Path, downscale: int | None = None, *, up: str | None 
 
     Args:
         path: a folder with transforms_train.json and transforms_test.json, or one transforms.json (whose
-            train_filenames and test_filenames decide, else views alternate), or another layout of one scene.
+            train_filenames and test_filenames decide, otherwise views alternate), or another layout of one scene.
             "example-car" comes with the package.
         downscale: as in `read_views`.
         up: as in `read_views`.

@@ -34,7 +34,7 @@ class WithSupport(TaskWrapper):
             raise ValueError(f"support: expected at least 1 view, got {self.count}")
 
     def change(self, task: Task) -> Task:
-        """The task with so many support views; ValueError where the object has fewer views."""
+        """The task with `count` support views; ValueError where the object has fewer views."""
         total = len(task.support) + len(task.query)
         if self.count > total:
             raise ValueError(
@@ -74,7 +74,7 @@ class WithBounds(TaskWrapper):
 
 @dataclass(frozen=True)
 class Shown(TaskWrapper):
-    """Tasks of which so many views are shown, as far apart as they stand, and some query views are kept back.
+    """Tasks of which some views are shown, those that stand farthest apart, and some query views are kept back.
 
     Attributes:
         count: views that are shown, support and query alike, at most all but those that are kept back.

@@ -28,7 +28,7 @@ LEVEL = 0.1  # sine of the tilt, root mean square over the cameras, up to which 
 def guess_up(cameras: PinholeCamera) -> str | None:
     """The direction that is up in the world, as people and programs hold cameras: level, and not upside down.
 
-    The horizontal axis of a level camera is perpendicular to it. An axis of the world goes first; else it is the
+    The horizontal axis of a level camera is perpendicular to it. An axis of the world goes first; otherwise it is the
     direction that all horizontal axes are most nearly perpendicular to.
 
     Returns:
@@ -127,7 +127,7 @@ def upright(views: Views, up: str) -> Views:
     """
     turn = y_up_from(up)
     if up == "y":
-        return views
+        return views if views.up in (None, "y") else replace(views, up="y")
     cameras = upright_cameras(views.cameras, up)
     x, y, z = (turn[:3, :3] @ torch.tensor(views.bounds.centre, dtype=torch.float64)).tolist()
     return replace(views, cameras=cameras, bounds=Sphere((x, y, z), views.bounds.radius), up=views.up and "y")

@@ -9,7 +9,6 @@ from hyperplanes.adaptation.context import observe
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.network import in_use
-from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 
@@ -41,7 +40,8 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
         )
     planes = model.config.network.planes
     if len(shown) < planes and len(model.known_rig):
-        found.append(f"{len(shown)} views are shown and the model was trained with {planes}: some stand for several")
+        stated = f"{len(shown)} views are shown and the model was trained with {planes}"
+        found.append(f"{stated}: some views fill several planes")
     unlike, angle = _unlikeness(model, shown)
     if unlike is not None and unlike > UNLIKE:
         found.append(
@@ -93,13 +93,10 @@ def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | Non
     holdout = torch.linspace(0, len(shown) - 1, min(HELD_OUT, len(shown) // 2) + 2)[1:-1].round().long()
     rest = [index for index in range(len(shown)) if index not in holdout.tolist()]
     shown = shown.resized(SHOWN_SIZE)
-    truth_views, remaining = shown[holdout], shown[rest]
-    scale = min(1.0, HELD_OUT_SIZE / max(truth_views.size))
-    size = max(1, round(truth_views.size[0] * scale)), max(1, round(truth_views.size[1] * scale))
-    truth = torch.nn.functional.interpolate(truth_views.images, size, mode="area")
-    cameras = camera.resized(truth_views.cameras, *size)
+    left_out, remaining = shown[holdout].resized(HELD_OUT_SIZE), shown[rest]
     fields: list[Renderable] = [model.adapt(remaining).without_residuals(), NearestView().adapt(remaining)]
-    first, second = (float(psnr(each.render(cameras).images.clamp(0, 1), truth).mean()) for each in fields)
+    pictures = (each.render(left_out.cameras).images.clamp(0, 1) for each in fields)
+    first, second = (float(psnr(images, left_out.images).mean()) for images in pictures)
     return first, second
 
 

@@ -43,7 +43,7 @@ class Record:
 
     @contextmanager
     def working(self, name: str, settings: Mapping[str, Any], *outputs: Path) -> Generator[None]:
-        """The time in which something is worked on; an exception leaves it unfinished, to be gone on with.
+        """The time in which something is worked on; an exception leaves it unfinished; the next call resumes it.
 
         Args:
             name: of the work.

@@ -186,7 +186,7 @@ class Checkpointing:
 
 
 def _delete_old(folder: Path, newest: str, kept: int) -> None:
-    """Delete all states but the newest and those of the last steps before it; later ones are of a run gone back on."""
+    """Delete all states but the newest and those of the last steps before it; later ones are of an abandoned run."""
     states = sorted(path.name for path in folder.glob("training-*.safetensors") if STATE.fullmatch(path.name))
     earlier = [name for name in states if _step(name) < _step(newest)]
     staying = {newest, *earlier[len(earlier) - min(kept - 1, len(earlier)) :]}

@@ -27,7 +27,7 @@ def _by_torchrun() -> bool:
 
 
 def count_processes(devices: int, nodes: int) -> tuple[int, int]:
-    """Processes a node, and nodes: as torchrun says where it started this process, else as asked for.
+    """Processes a node, and nodes: as torchrun says where it started this process, otherwise as asked for.
 
     Args:
         devices: asked for on each node.

@@ -99,7 +99,7 @@ def gradient_norms(model: HyperPlanes) -> dict[str, float]:
 
 
 class Speed:
-    """Rays a second since the last report, and the seconds that are left of so many steps."""
+    """Rays a second since the last report, and the seconds that the remaining steps will take."""
 
     def __init__(self, step: int, steps: int, rays: int) -> None:
         self._first, self._steps, self._rays = step, steps, rays

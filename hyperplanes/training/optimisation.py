@@ -47,7 +47,7 @@ class Optimisation:
             optimiser.zero_grad(set_to_none=True)
 
     def step(self, number: int) -> None:
-        """Move the weights along their gradients, after so many steps."""
+        """Move the weights along their gradients, after `number` steps."""
         for optimiser, rate in zip(self.optimisers, self._rates, strict=True):
             optimiser.param_groups[0]["lr"] = rate * self.rate_factor(number)
         if self.config.clip:
@@ -56,7 +56,7 @@ class Optimisation:
             optimiser.step()
 
     def rate_factor(self, number: int) -> float:
-        """What rates are multiplied with after so many steps: from 0 to 1 in the warm-up, then along half a cosine."""
+        """What rates are multiplied by after `number` steps: from 0 to 1 in the warm-up, then along half a cosine."""
         config = self.config
         if number < config.warmup:
             return (number + 1) / config.warmup

@@ -76,6 +76,10 @@ def test_other_features_are_tried_while_too_few_pictures_are_registered(found, k
     model = pipeline._poses(drawn(tmp_path, 20), False, work)
     assert (len(model), list(models)) == (kept, [])
     assert len(work.notes) == len(found) - 1 + advised
+    again = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(), progress=print, notes=[])
+    monkeypatch.setattr(pipeline.SparseModel, "load", lambda path: model)
+    assert pipeline._poses(drawn(tmp_path, 20), False, again) is model
+    assert again.notes == work.notes
 
 
 def test_poses_are_those_of_the_pictures_whatever_else_is_asked_for(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Source of truth: pictures drawn from masks that are known."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -168,6 +169,19 @@ def test_masks_that_came_with_photographs_stay_as_they_are_beside_others(ball_se
     mended = "they were mended by what these show together"
     said = [f"1 masks contradict the others, {done}" for done in ("look at them: 2", f"{mended}: 9")]
     assert [note for note in captured.notes if "contradict" in note] == said
+
+
+def test_points_mark_the_pixels_that_they_are_seen_in(ball_seen):
+    """Of a picture scaled down by four: pixel (43, 23) lies in pixel (10, 5)."""
+    cv2 = pytest.importorskip("cv2")
+    from hyperplanes.capture.masks.grabcut import GrabCut
+
+    model, pose = ball_seen[0], np.linalg.inv(ball_seen[0].camera_from_world[0])
+    point = pose[:3, :3] @ np.linalg.solve(model.calibrations[0], [43.0, 23.0, 1.0]) * 3 + pose[:3, 3]
+    seen = {"observed": np.array([[0, 0]]), "pixels": np.array([[43.0, 23.0]])}
+    model = replace(model, points=point[None], colours=np.zeros((1, 3), np.uint8), errors=np.zeros(1), **seen)
+    labels = GrabCut(model)._seeds(0, (24, 24), 0.25)
+    assert np.argwhere(labels == cv2.GC_FGD).mean(0).tolist() == [5, 10]
 
 
 def test_a_piece_that_a_mask_lacks_is_found_by_its_colour():

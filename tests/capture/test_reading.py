@@ -68,9 +68,9 @@ def test_the_rarer_shape_lies_on_its_side_and_knows_where_up_is(upright, tmp_pat
 
 
 def test_numbers_in_names_count(upright, tmp_path):
-    for name in ("IMG_10.png", "IMG_9.png", "IMG_100.png"):
+    for name in ("IMG_10.png", "IMG_9.png", "IMG_100.png", "IMG_9²3.png"):
         save(upright, tmp_path / name)
-    assert [path.stem for path in find_photographs(tmp_path)] == ["IMG_9", "IMG_10", "IMG_100"]
+    assert [path.stem for path in find_photographs(tmp_path)] == ["IMG_9", "IMG_9²3", "IMG_10", "IMG_100"]
 
 
 def test_the_focal_length_comes_from_exif(upright, tmp_path):

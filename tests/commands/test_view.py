@@ -8,10 +8,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from hyperplanes.cli import main
 from hyperplanes.commands import view
 from hyperplanes.export import baking, live, voxel_fitting
+from tests.reference_rendering import small_model
 
 
 class NotingViewer:
@@ -119,6 +121,22 @@ def test_what_was_made_of_another_number_of_views_is_taken_off_the_page(viewer, 
     assert view.run(view.Arguments(Path("example-car"))) == 0
     *_, removed, number = viewer.made[0].shown_others
     assert (removed, number) == ("nearest_view: not adapted yet", 1)
+
+
+def test_the_model_is_compared_with_by_the_name_of_its_method_too(tmp_path):
+    model = small_model(hypernetwork=None)
+    model.save(tmp_path)
+    names = ("point_multiplane", "hyperplanes", "nearest_view")
+    found = view._others(view.Arguments(Path("example-car"), tmp_path, compare=names), torch.device("cpu"))
+    assert [found[name].config for name in names[:2]] == [model.config] * 2
+
+
+@pytest.mark.parametrize("option", [["--steps", "1"], ["--refine-poses"], ["--learn-background"], ["--fit", "0"]])
+def test_a_baked_file_is_finished(option, viewer, monkeypatch, capsys):
+    monkeypatch.setattr(view, "load_source", lambda *_, **__: baking.BakedScene(None))
+    monkeypatch.setattr(view, "read_scene", None)  # refused before pictures are read
+    assert main(["view", "example-car", *option]) == 2
+    assert f"{option[0]}: expected none with a baked file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("part", ["baking", "fitting"])

@@ -60,6 +60,10 @@ def test_what_nerfstudio_did_to_the_world_is_undone(tmp_path):
     scene = {"applied_transform": applied.tolist(), "applied_scale": 2.0}
     found = read_camera_path(path, stated, scene).cameras
     torch.testing.assert_close(found.extrinsics, camera.fibonacci_sphere(3, 3.0), atol=1e-5, rtol=0)
+    # of data whose files state a factor alone: R, t, and the factor times that of the files
+    stated = written(tmp_path / "c.json", {"transform": TURNED.tolist(), "scale": 2 * scale})
+    found = read_camera_path(path, stated, {"applied_scale": 2.0}).cameras
+    torch.testing.assert_close(found.extrinsics, camera.fibonacci_sphere(3, 3.0), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -91,4 +95,6 @@ def test_what_is_no_path_is_refused(tmp_path, change, message):
 def test_what_is_left_out_is_said(tmp_path):
     path = written(tmp_path / "a.json", document(poses(1), crop={"crop_scale": [1, 1, 1]}))
     assert read_camera_path(path).notes == ("its crop is left out",)
+    path = written(tmp_path / "b.json", document(poses(1), crop=None, render_time=None))
+    assert read_camera_path(path).notes == ()
     assert math.isclose(read_camera_path(path).seconds, 1.5)

@@ -240,6 +240,8 @@ def test_a_file_of_another_name_is_all_there_is_of_a_scene(scene, tmp_path):
     assert task.support.names + task.query.names == (scene.names[0], scene.names[4], scene.names[2])
     assert open_dataset(tmp_path / "subset.json").names() == [tmp_path.name]
     assert len(read_task(tmp_path / "transforms.json").support) == 4
+    whole, _ = read_scene(tmp_path / "subset.json", Console(silent=True), all_views=True)
+    assert whole.name == task.name == tmp_path.name
 
 
 def test_a_camera_path_is_in_the_world_of_the_file_whether_it_or_its_folder_is_named(scene, tmp_path):
@@ -257,6 +259,21 @@ def test_a_camera_path_is_in_the_world_of_the_file_whether_it_or_its_folder_is_n
     ]
     assert torch.equal(*found)
     assert not torch.allclose(found[0], task.support.cameras.extrinsics[:3], atol=0.1)
+
+
+def test_a_camera_path_is_in_the_world_of_the_poses_of_an_archive(scene, tmp_path):
+    """The poses of the pictures as a path are the cameras of the pictures."""
+    poses = [scene.opengl(index) for index in range(len(scene.pictures))]
+    np.savez(
+        tmp_path / "ball.npz", images=np.stack(scene.pictures), cam_poses=np.array(poses), focal=scene.matrix[0, 0]
+    )
+    frames = [{"camera_to_world": pose, "fov": 60.0} for pose in poses]
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"render_width": 8, "render_height": 8, "camera_path": frames}))
+    task, up = read_scene(tmp_path / "ball.npz", Console(silent=True), all_views=True)
+    assert task.name == read_task(tmp_path / "ball.npz").name == "ball"
+    cameras, _ = read_path(path, None, None, task.support, up, tmp_path / "ball.npz", Console(silent=True))
+    torch.testing.assert_close(cameras.extrinsics, task.support.cameras.extrinsics, atol=1e-5, rtol=0)
 
 
 def test_what_a_reader_stumbles_over_is_one_line(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Source of truth: geometry by hand, and that turning the world and its cameras together changes no picture."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -51,6 +52,7 @@ def test_every_pixel_sees_the_turned_world_as_it_saw_the_world():
 def test_y_up_is_left_alone_and_another_axis_is_refused():
     views = z_up_views()
     assert upright(views, "y") is views
+    assert upright(replace(views, up="z"), "y").up == "y", "as the caller says, whatever the files say"
     task = upright_task(Task(views[:2], views[2:], "x"), "z")
     assert (len(task.support), len(task.query), task.name) == (2, 3, "x")
     for wrong in ("w", "1,2", "0,0,0", "nan,0,1", ""):

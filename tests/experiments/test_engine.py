@@ -267,7 +267,10 @@ def test_an_estimate_counts_every_seed(out, given, monkeypatch, capsys):
     ("words", "expected"),
     [
         (["--scale", "paper"], "expected --data car=FOLDER"),
-        (["--data", "cars"], "--data: expected CLASS=FOLDER with a class of car, chair, plane, lamp, got 'cars'"),
+        (["--data", "cars"], "CLASS=FOLDER, each of the classes car, chair, plane, lamp once, got 'cars'"),
+        (["--data", "car="], "once, got 'car='"),
+        (["--data", "car=A", "car=B"], "once, got 'car=B'"),
+        (["--data", "boat=A"], "once, got 'boat=A'"),
         (["--seeds", "0"], "--seeds: expected at least 1, got 0"),
     ],
 )
@@ -276,3 +279,13 @@ def test_mistakes_get_one_line(words, expected, tmp_path, capsys):
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert expected in lines[0]
+
+
+def test_a_table_with_classes_of_its_own_takes_data_of_them(tmp_path, monkeypatch, capsys):
+    """The folder is looked at, which is not there."""
+    table = EXPERIMENTS["target"]
+    cells = tuple(replace(cell, on="boat", trained=replace(cell.trained, on="boat")) for cell in table.cells)
+    monkeypatch.setitem(EXPERIMENTS, "boats", replace(table, name="boats", cells=cells))
+    data = ["--data", f"boat={tmp_path / 'none'}"]
+    assert main(["reproduce", "boats", "--scale", "smoke", "--out", str(tmp_path), *data]) == 2
+    assert f"{tmp_path / 'none'}: expected" in capsys.readouterr().err

@@ -66,7 +66,7 @@ def test_a_process_that_is_killed_ends_the_other_and_its_checkpoint_goes_on_in_o
     out = folder / "killed"
     assert read_json(out / "training.json")["step"] == 2
     assert not (out / ".lock").exists()
-    _, chosen = resolve(Arguments((folder,), out, steps=6, settings=tuple(OPTIONS)))
+    chosen = resolve(Arguments((folder,), out, steps=6, settings=tuple(OPTIONS)))
     resumed = start_training(chosen.model, chosen.training, Data(3), out)
     assert resumed.step == 2
     list(resumed.run())

@@ -110,12 +110,12 @@ def test_one_number_is_a_list_of_one_where_a_list_is_expected():
 def test_a_configuration_written_is_the_one_read(name, tmp_path):
     chosen = preset(name).by_method("multiplane")
     chosen = replace(chosen, training=replace(chosen.training, seed=4))
-    write_experiment(tmp_path / "config.yaml", "multiplane", chosen)
+    write_experiment(tmp_path / "config.yaml", chosen)
     found = read_experiment(tmp_path / "config.yaml")
     assert found["method"] == "multiplane"
     again = changed(preset("quick"), found)
     assert (again.model, again.training) == (chosen.model, chosen.training)
-    assert yaml.safe_load(document("x", chosen))["model"] == json.loads(json.dumps(chosen.model.as_json()))
+    assert yaml.safe_load(document(chosen))["model"] == json.loads(json.dumps(chosen.model.as_json()))
 
 
 def test_another_kind_has_its_own_settings():
@@ -140,25 +140,24 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
     given = Arguments(
         data=(), out=tmp_path, config=path, steps=11, settings=("--training.rays", "13", "--model.sampling.fine=5")
     )
-    method, chosen = resolve(given)
+    chosen = resolve(given)
     small = preset("small")
-    assert method == "nerf"
-    assert (chosen.model.target, chosen.model.hypernetwork) == ("nerf", None)
+    assert chosen.model.method == chosen.model.target == "nerf"
+    assert chosen.model.hypernetwork is None
     assert chosen.model.network == TargetConfig(
         depth=3, width=128, planes=8, point_frequencies=6, direction_frequencies=2
     )
     assert chosen.model.sampling == Hierarchical(8, 5)
     of_subsets = {"views": (), "rotations": 0.0, "volume_loss": 0.0}
     assert chosen.training == replace(small.training, learning_rate=1e-3, steps=11, rays=13, **of_subsets)
-    assert (
-        resolve(replace(given, method="multiplane", protocol="ray_marching", settings=()))[1].model.sampling
-        == RayMarching()
-    )
-    assert resolve(replace(given, cache_size=0.5))[1].training.memory == 2**29
+    other = resolve(replace(given, method="multiplane", protocol="ray_marching", settings=()))
+    assert other.model.sampling == RayMarching()
+    assert resolve(replace(given, cache_size=0.5)).training.memory == 2**29
     with pytest.raises(ValueError, match="^--cache-size: "):
         resolve(replace(given, cache_size=-1))
     none = resolve(Arguments(data=(), out=tmp_path, settings=("--model.hypernetwork", "null")))
-    assert none == ("point_multiplane", changed(preset("quick"), {"model": {"hypernetwork": None}}))
+    assert none == changed(preset("quick"), {"model": {"hypernetwork": None}})
+    assert none.model.method == "point_multiplane"
 
 
 @pytest.mark.parametrize(

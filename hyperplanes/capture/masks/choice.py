@@ -25,7 +25,7 @@ LOOKED_AT = 12  # pictures by which a background is called plain
 
 
 def check_mask(name: str) -> None:
-    """Refuse a way that cannot be gone, before anything else is done.
+    """Refuse a masking method that cannot work here, before anything else is done.
 
     Args:
         name: one of MASKS, or a command.
@@ -47,8 +47,8 @@ def check_mask(name: str) -> None:
 def choose_masker(name: str, model: SparseModel, pictures: Sequence[np.ndarray]) -> tuple[Masker, str]:
     """A way to find masks, and its name.
 
-    `auto` takes the colour of the background where it is plain, the network where its packages are installed, and
-    GrabCut else.
+    `auto` takes the colour of the background where it is plain, the network where its packages are installed,
+    otherwise GrabCut.
 
     Args:
         name: one of MASKS but none, or a command, which `check_mask` lets pass.

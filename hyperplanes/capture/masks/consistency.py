@@ -144,7 +144,7 @@ class _Judged:
     sphere: Sphere
 
     def hull(self, votes: int, without: int | None = None) -> Occupancy:
-        """The voxels that fewer than so many masks rule out, one of them left out where asked."""
+        """The voxels that fewer than `votes` masks rule out, one of them left out where asked."""
         counts = self.counts if without is None else self.counts - self.ruled[without].int()
         return Occupancy(self.candidate & (counts < votes), self.sphere)
 

@@ -60,8 +60,8 @@ class GrabCut:
         radius = max(1, round(SEED * max(size)))
         for chosen, label in ((False, self._cv2.GC_BGD), (True, self._cv2.GC_FGD)):
             points = self._model.points[seen[self._chosen[seen] == chosen]]
-            (x, y), front = self._model.project(camera, points)
-            for column, row in zip(x[front > 0] * scale, y[front > 0] * scale, strict=True):
+            places, front = self._model.project(camera, points)
+            for column, row in ((places + 0.5) * scale - 0.5).T[front > 0]:
                 self._cv2.circle(labels, (round(column), round(row)), radius, int(label), -1)
         return labels
 
@@ -71,7 +71,7 @@ def extended(
     mask: Float[np.ndarray, "height width"],
     possible: Bool[np.ndarray, "row column"],
 ) -> Float[np.ndarray, "height width"]:
-    """A mask and what resembles it, as far as edges of the picture.
+    """A mask and what resembles it, up to edges of the picture.
 
     Args:
         picture: 8-bit RGB.

@@ -15,6 +15,7 @@ from hyperplanes.data.pictures.frames import Frame, Listing, scaled_matrix
 from hyperplanes.data.pictures.images import image_size
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import check_pose
+from hyperplanes.data.pictures.undistort import COEFFICIENTS
 from hyperplanes.utilities.files import DataError, check_link, inside, malformed, read_bytes, read_text
 
 __all__ = ["find_model", "image_names", "read_colmap"]
@@ -29,7 +30,6 @@ _MODELS = {
     6: ("FULL_OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
 }
 _PARAMETERS = dict(_MODELS.values())
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _PLACES = ("sparse", "dense/sparse", "dense", "distorted/sparse", "colmap/sparse", "colmap")
 
 
@@ -185,7 +185,7 @@ def _camera(model: str, width: int, height: int, values: list[float], path: Path
     named = dict(zip(_PARAMETERS[model], values, strict=True))
     focal = named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
     matrix = np.array([[focal[0], 0.0, named["cx"] - 0.5], [0.0, focal[1], named["cy"] - 0.5], [0.0, 0.0, 1.0]])
-    return _Camera((height, width), matrix, tuple(named.get(name, 0.0) for name in _COEFFICIENTS))
+    return _Camera((height, width), matrix, tuple(named.get(name, 0.0) for name in COEFFICIENTS))
 
 
 def _pose(quaternion: npt.NDArray[np.float64], translation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -115,7 +115,7 @@ def read_arrays(path: str | Path, names: set[str], root: Path | None = None) -> 
 
 
 def read_array(path: Path, expected: str, largest: int, root: Path) -> npt.NDArray[Any]:
-    """The content of an .npy file of so many bytes at most; what is broken, or a pickle, is a DataError."""
+    """The content of an .npy file of at most `largest` bytes; what is broken, or a pickle, is a DataError."""
     with malformed(path, expected):
         return np.load(io.BytesIO(read_bytes(path, largest, root)), allow_pickle=False)
 
@@ -135,10 +135,10 @@ def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -
     """The catalogue of a folder in one of the two layouts.
 
     learnit: CLASS_splits.json beside the folder of the class; CLASSs/NAME/transforms.json with its pictures beside it.
-    Names whose folder is missing are skipped and counted. The authors': CLASS/sampled/VIEWS_NAME.npz, sorted by name,
-    the first 80 % to train on and the last 20 % to test, unless a manifest says otherwise. In both, the first half of
-    the views is support and the rest query, as learnit's notebook and the authors' code take 25 and 25 of 50; in data
-    sets with a manifest, which `generate` wrote, views alternate.
+    The authors': CLASS/sampled/VIEWS_NAME.npz, sorted by name, the first 80 % to train on and the last 20 % to test,
+    unless a manifest says otherwise. In both, objects that are listed and missing are skipped and counted; the first
+    half of the views is support and the rest query, as learnit's notebook and the authors' code take 25 and 25 of 50;
+    in data sets with a manifest, which `generate` wrote, views alternate.
 
     Args:
         folder: what may be in one of the layouts.
@@ -170,8 +170,11 @@ def _authors(
     splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
     if isinstance(manifest.get("splits"), dict):
         for split in SPLITS:
-            names = (str(name).replace("_", "-") for name in manifest["splits"].get(split, []))
+            names = [str(name).replace("_", "-") for name in manifest["splits"].get(split, [])]
             splits[split] = tuple(name for name in names if name in paths)
+            if missing := [name for name in names if name not in paths]:
+                skipped.append(f"{folder / 'manifest.json'}: skipped {len(missing)} of {len(names)} objects of {split} "
+                               f"without an archive, as {missing[0]}")  # fmt: skip
     else:
         for home in sorted({path.parent for path in archives}):
             names = sorted(name for name, path in paths.items() if path.parent == home)

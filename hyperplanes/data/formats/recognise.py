@@ -16,7 +16,16 @@ from hyperplanes.data.pictures.posed import Posed, PosedTask
 from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.files import DataError, read_json
 
-__all__ = ["LAYOUTS", "Layout", "find_catalogue", "find_layouts", "is_scene", "read_posed", "read_posed_task"]
+__all__ = [
+    "LAYOUTS",
+    "Layout",
+    "find_catalogue",
+    "find_layouts",
+    "is_scene",
+    "read_posed",
+    "read_posed_task",
+    "scene_name",
+]
 
 
 @dataclass(frozen=True)
@@ -27,7 +36,7 @@ class Layout:
         found: what is true of a folder in it.
         read: all of its pictures; a folder, a factor to scale down by, and the root that no file may lie outside of,
             symbolic links followed.
-        read_task: support and query, where the layout has splits of its own; views alternate else.
+        read_task: support and query, where the layout has splits of its own; otherwise views alternate.
     """
 
     found: Callable[[Path], object]
@@ -80,7 +89,7 @@ def find_layouts() -> tuple[Layout, ...]:
 def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
     """The catalogue of whatever lies at a path.
 
-    A manifest.json that names its layout decides; else the folder's content does: a posed scene (one object, in the
+    A manifest.json that names its layout decides, otherwise the folder's content: a posed scene (one object, in the
     test split), SRN's, learnit's, the HyperPlanes authors', NMR's, CO3D's, Objaverse's or OmniObject3D's layout, or a
     folder of posed scenes (all in the test split).
 
@@ -104,7 +113,7 @@ def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
 
 def _find_catalogue(path: Path, legacy: bool) -> Catalogue:
     if path.is_file() and path.suffix in (".json", ".npz"):
-        return _one_scene(path, path.stem if path.suffix == ".npz" else path.resolve().parent.name, legacy)
+        return _one_scene(path, legacy)
     if not path.is_dir():
         refuse_unposed(path)
         raise DataError(path, "the folder of a data set", "nothing", "check the path, or run hyperplanes generate")
@@ -112,12 +121,12 @@ def _find_catalogue(path: Path, legacy: bool) -> Catalogue:
     if manifest.get("format") == FORMAT and manifest.get("layout", "native") == "native":
         return native(path, manifest)
     if nsvf.is_nsvf(path):
-        return _one_scene(path, path.resolve().name)
+        return _one_scene(path)
     found = srn.catalogue(path, manifest) or npz.catalogue(path, manifest, legacy=legacy)
     if found is not None:
         return found
     if _find_format(path) is not None:
-        return _one_scene(path, path.resolve().name)
+        return _one_scene(path)
     for published in (nmr.catalogue, co3d.catalogue, objaverse.objaverse, objaverse.omniobject):
         if (found := published(path)) is not None:
             return found
@@ -157,22 +166,29 @@ def read_posed_task(path: str | Path, downscale: int | None = None, *, legacy: b
         legacy: of an .npz, as in `npz.read_npz`.
 
     Returns:
-        The task, named after the folder or the .npz file. Anything wrong with a file is a DataError.
+        The task, named as by `scene_name`. Anything wrong with a file is a DataError.
     """
     path = Path(path)
+    folder, name = path, scene_name(path)
     if path.is_file() and path.suffix == ".npz":
-        return PosedTask.alternating(npz.read_npz(path, legacy=legacy), path.stem).downscaled(downscale)
-    folder = path
+        return PosedTask.alternating(npz.read_npz(path, legacy=legacy), name).downscaled(downscale)
     if path.is_file() and path.suffix == ".json":
         folder = path.parent
         if path not in find_transforms(folder):
-            return read_transforms_task(path, folder.resolve().name, downscale=downscale)
-    return _format(folder).task(folder, folder.resolve().name, downscale, folder)
+            return read_transforms_task(path, name, downscale=downscale)
+    return _format(folder).task(folder, name, downscale, folder)
 
 
-def _one_scene(path: Path, name: str, legacy: bool = False) -> Catalogue:
+def scene_name(path: Path) -> str:
+    """What one scene is called: an .npz file by its own name, other files and folders by that of the folder."""
+    if path.is_file() and path.suffix == ".npz":
+        return path.stem
+    return (path.parent if path.is_file() else path).resolve().name
+
+
+def _one_scene(path: Path, legacy: bool = False) -> Catalogue:
     """One posed scene as a data set of one test object."""
-    splits = {"train": (), "val": (), "test": (name,)}
+    splits = {"train": (), "val": (), "test": (scene_name(path),)}
     return Catalogue("posed", splits, lambda _: read_posed_task(path, legacy=legacy))
 
 

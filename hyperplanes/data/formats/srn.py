@@ -32,7 +32,7 @@ def read_srn(folder: Path, root: Path, bounds: Sphere | None = None) -> Posed:
     """The posed pictures of one object.
 
     Poses are OpenCV camera-to-world. The pictures have no alpha: where every pixel of their border is white, masks are
-    made from what is not purely white, as pixelNeRF does; else there are none. The principal point counts from the
+    made from what is not purely white, as pixelNeRF does; otherwise there are none. The principal point counts from the
     pictures' borders (half-pixel centres) and is scaled with the focal length when the pictures have another size than
     the file says.
 

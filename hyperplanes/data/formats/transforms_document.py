@@ -16,7 +16,7 @@ import numpy.typing as npt
 from hyperplanes.utilities.axes import flip_camera_axes, invert_poses
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["calibration", "opencv_from_opengl", "stated_size", "transforms_document"]
+__all__ = ["calibration", "number", "opencv_from_opengl", "stated_size", "transforms_document"]
 
 _NOT_PERSPECTIVE = ("is_fisheye", "ortho")  # fields by which instant-ngp marks other cameras
 _NO_DISTORTION = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL"}
@@ -109,8 +109,8 @@ def calibration(
     stated = _stated(fields, size, source)
     scale = (width / stated[0], height / stated[1])
     if "fl_x" in fields:
-        focal_x = _number(fields, "fl_x", 0.0, source) * scale[0]
-        focal_y = _number(fields, "fl_y", focal_x / scale[0], source) * scale[1]
+        focal_x = number(fields, "fl_x", 0.0, source) * scale[0]
+        focal_y = number(fields, "fl_y", focal_x / scale[0], source) * scale[1]
     elif "camera_angle_x" in fields:
         focal_x = width / 2 / math.tan(_angle(fields, "camera_angle_x", source) / 2)
         focal_y = focal_x
@@ -122,8 +122,8 @@ def calibration(
         )
     if focal_x <= 0 or focal_y <= 0:
         raise DataError(str(source), "positive focal lengths", f"{focal_x:g}, {focal_y:g}", "correct the file")
-    centre_x = _number(fields, "cx", stated[0] / 2, source) * scale[0]
-    centre_y = _number(fields, "cy", stated[1] / 2, source) * scale[1]
+    centre_x = number(fields, "cx", stated[0] / 2, source) * scale[0]
+    centre_y = number(fields, "cy", stated[1] / 2, source) * scale[1]
     shift = 0.0 if legacy else 0.5
     return np.array([[focal_x, 0.0, centre_x - shift], [0.0, focal_y, centre_y - shift], [0.0, 0.0, 1.0]])
 
@@ -146,7 +146,7 @@ def stated_size(fields: dict[str, Any], source: object) -> tuple[int, int] | Non
 
 def _stated(fields: dict[str, Any], size: tuple[int, int], source: object) -> tuple[float, float]:
     """Stated width and height, those of the picture where absent."""
-    stated = _number(fields, "w", size[1], source), _number(fields, "h", size[0], source)
+    stated = number(fields, "w", size[1], source), number(fields, "h", size[0], source)
     if min(stated) <= 0:
         raise DataError(str(source), "positive w and h", f"{stated[0]:g} x {stated[1]:g}", "correct the file")
     return stated
@@ -161,7 +161,18 @@ def _numbers(matrix: npt.NDArray[np.float64]) -> dict[str, float]:
     }
 
 
-def _number(fields: dict[str, Any], name: str, default: float, source: object) -> float:
+def number(fields: dict[str, Any], name: str, default: float, source: object) -> float:
+    """A number that a transforms.json or one frame of it states.
+
+    Args:
+        fields: as in `calibration`.
+        name: of the field.
+        default: where it is absent.
+        source: the file, for messages.
+
+    Raises:
+        DataError: not a finite number.
+    """
     value = fields.get(name, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise DataError(str(source), f"a finite number as {name}", repr(value), "correct the file")
@@ -169,7 +180,7 @@ def _number(fields: dict[str, Any], name: str, default: float, source: object) -
 
 
 def _angle(fields: dict[str, Any], name: str, source: object) -> float:
-    value = _number(fields, name, 0.0, source)
+    value = number(fields, name, 0.0, source)
     if not 0 < value < math.pi:
         raise DataError(str(source), f"{name} in radians between 0 and pi", f"{value:g}", "correct the file")
     return value

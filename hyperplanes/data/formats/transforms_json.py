@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from hyperplanes.data.formats.apps.calibration import brown_lens
-from hyperplanes.data.formats.transforms_document import calibration, opencv_from_opengl, stated_size
+from hyperplanes.data.formats.transforms_document import calibration, number, opencv_from_opengl, stated_size
 from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.frames import Frame, Listing, assemble
 from hyperplanes.data.pictures.images import image_size
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import PosedTask, check_pose
-from hyperplanes.data.pictures.undistort import distortion
+from hyperplanes.data.pictures.undistort import COEFFICIENTS
 from hyperplanes.data.upright import stated_up
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files import DataError, check_link, inside, read_json
@@ -77,7 +77,7 @@ def read_transforms_task(
     """Support and query of one scene.
 
     transforms_train.json is the support and transforms_test.json (or _val) the query where they are; in one
-    transforms.json, `train_filenames` and `test_filenames` decide; else views alternate, the first one support.
+    transforms.json, `train_filenames` and `test_filenames` decide; otherwise views alternate, the first one support.
 
     Args:
         path: the folder that holds the files, or one file that is all there is.
@@ -192,7 +192,7 @@ def _frame(path: Path, fields: dict[str, Any], legacy: bool, root: Path) -> Fram
 
 def _lens(fields: dict[str, Any], picture: Path, path: Path) -> tuple[float, ...]:
     """OpenCV's coefficients. nerfstudio's k4 is that of Brown's r^8, but for OpenCV's own model with a quotient."""
-    stated = distortion(fields, path)
+    stated = tuple(number(fields, name, 0.0, path) for name in COEFFICIENTS)
     k1, k2, p1, p2, k3, k4, k5, k6 = stated
     if not k4 or k5 or k6 or fields.get("camera_model") == "FULL_OPENCV":
         return stated

@@ -1,6 +1,6 @@
 """Do the poses mean what the file says? Only with the right ones do silhouettes agree, and corners match.
 
-Masks decide where there are some, else corners of the pictures; what could not be checked is said.
+Masks decide where there are some, otherwise corners of the pictures; what could not be checked is said.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def masks_tell(views: Views) -> bool:
 def small_masks(
     views: Views, pixels: int = MASK, most: int = MOST_VIEWS
 ) -> tuple[Float[Tensor, "view 1 height width"], PinholeCamera]:
-    """Masks of up to so many views, spread over all, at up to so many pixels a side, with their cameras."""
+    """Masks of at most `most` views, spread over all, at most `pixels` a side, with their cameras."""
     assert views.masks is not None
     masks, cameras = views.masks, views.cameras
     if len(views) > most:
@@ -116,7 +116,7 @@ def small_masks(
 def silhouettes(
     points: Float[Tensor, "voxel 3"], hull: Occupancy, cameras: PinholeCamera
 ) -> Bool[Tensor, "view height width"]:
-    """Which pixels see a voxel: its centre's, those around it as far as half the voxel reaches, and gaps of two."""
+    """Which pixels show a voxel: its centre's, those within half a voxel of it, and gaps of two pixels between."""
     height, width = camera.image_size(cameras)
     matrices = camera.projection_matrices(cameras)
     seen = torch.zeros(len(matrices), height, width, dtype=torch.bool)

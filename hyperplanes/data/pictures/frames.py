@@ -114,7 +114,7 @@ def assemble(listing: Listing, downscale: int | None = None, *, complete: bool =
 
     Args:
         listing: what the files say.
-        downscale: take the mean of so many by so many pixels; None stands for as many as leave a megapixel at most.
+        downscale: reduce the pictures by this factor, averaging pixels; None leaves a megapixel at most.
         complete: a missing picture is an error, and nothing is scaled down unless asked for: data of ours.
 
     Returns:

@@ -168,7 +168,7 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
 
 
 def opacity_of(mask: Pixels, has_alpha: bool) -> UInt8[np.ndarray, "height width"]:
-    """What a picture of a mask says: its alpha where some of it is not opaque, else its brightest channel.
+    """What a picture of a mask says: its alpha where some of it is not opaque, otherwise its brightest channel.
 
     The alpha of a cut-out, a photograph whose background is transparent, is its mask. Where nothing is brighter than 1,
     that is the object.

@@ -44,9 +44,9 @@ def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path) ->
 def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None) -> list[Path | None]:
     """The mask of each picture, found by its name or by its number; None for those that have none.
 
-    A mask is called as its picture with any ending, as its picture with _mask after its name, or as COLMAP has it, as
-    its picture with .png after it. Of several masks of one name in different folders it is the one whose folders are
-    called as those of the picture. Where no name fits, there are as many masks as pictures and all names are numbers,
+    A mask has the name of its picture with any ending, that with _mask after it, or as COLMAP has it, the name with
+    .png after the ending. Of several masks of one name in different folders it is the one whose folders have the same
+    names as those of the picture. Where no name fits, there are as many masks as pictures and all names are numbers,
     as NeuS publishes image/000000.png beside mask/000.png, both are taken in the order of their numbers.
 
     Args:
@@ -82,7 +82,7 @@ def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None
 
 
 def _of_the_same_folders(masks: Sequence[Path], picture: Path, folder: Path) -> Path:
-    """The mask in folders that are called as those of a picture, the innermost first; the last of one folder."""
+    """The mask in folders with the same names as those of a picture, the innermost first; the last of one folder."""
 
     def shared(mask: Path) -> int:
         pairs = zip(reversed(mask.relative_to(folder).parent.parts), reversed(picture.parent.parts), strict=False)
@@ -95,7 +95,7 @@ def _of_the_same_folders(masks: Sequence[Path], picture: Path, folder: Path) -> 
             folder,
             f"one mask for {picture}",
             f"{len(best)}: {', '.join(mask.relative_to(folder).as_posix() for mask in best[:3])}",
-            "put the masks into folders that are called as those of the pictures",
+            "put the masks into folders with the same names as those of the pictures",
         )
     return best[-1]
 

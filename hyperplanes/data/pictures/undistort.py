@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +12,7 @@ from torch.nn.functional import grid_sample
 from hyperplanes.geometry.distortion import inverse_distortion, turning_radius
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["COEFFICIENTS", "check_lens", "distort", "distortion", "undistort"]
+__all__ = ["COEFFICIENTS", "check_lens", "distort", "undistort"]
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's names, in OpenCV's order."""
@@ -23,28 +21,6 @@ GRID = 41  # places across the picture at which the lens is checked
 MOST_FOLDED = 0.02  # of them; polynomials fitted to the corners often turn just inside them
 
 Array = npt.NDArray[np.float64]
-
-
-def distortion(fields: dict[str, Any], source: object) -> tuple[float, ...]:
-    """OpenCV's eight coefficients from a file's fields, zero where absent.
-
-    Args:
-        fields: what may hold k1, k2, p1, p2, k3, k4, k5, k6.
-        source: the file, for the message.
-
-    Returns:
-        The coefficients in the order of COEFFICIENTS.
-
-    Raises:
-        DataError: a coefficient that is not a finite number.
-    """
-    values = []
-    for name in COEFFICIENTS:
-        value = fields.get(name, 0.0)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise DataError(str(source), f"a finite number as {name}", repr(value), "correct the file")
-        values.append(float(value))
-    return tuple(values)
 
 
 def distort(points: Array, coefficients: tuple[float, ...]) -> Array:

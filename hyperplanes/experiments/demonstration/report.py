@@ -156,7 +156,7 @@ def write_report(folder: Path, runner: Runner, settings: DemoSettings) -> None:
 
 
 def _turntable(checkpoint: Path, settings: DemoSettings, name: str, side: int, runner: Runner) -> Pixels:
-    """The frames of the turntable of an object of the class that was trained on, so many pixels a side."""
+    """The frames of the turntable of an object of the class that was trained on, `side` pixels a side."""
     model = HyperPlanes.from_pretrained(checkpoint).to(runner.device)
     support = model.arrange(runner.data.tasks(settings.class_name).task(name).support)
     return _round(model, support, orbit_cameras(support, settings.frames, size=side))

@@ -29,7 +29,7 @@ OBJECTS_A_STREAM = 4
 
 
 def step_generator(seed: int, step: int) -> torch.Generator:
-    """What the objects of the step after so many are drawn from."""
+    """What the objects of a step (the first is 0) are drawn from."""
     return torch.Generator().manual_seed(seed * 1_000_003 + step)
 
 

@@ -92,7 +92,7 @@ class EpisodeLoader:
         torch.linalg.det(torch.eye(3, device=model.rig.device))
 
     def batch(self, step: int) -> Batch:
-        """The objects of the step after so many, ready; one that is asked for the first time is made ready here."""
+        """The objects of a step (the first is 0), ready; one that is asked for the first time is made ready here."""
         names = self.names_of(step)
         draws = [Draw(name, self.get(name), self._generator(step, place)) for place, name in self._own(names)]
         count = self.config.tasks // self.processes.count
@@ -125,7 +125,7 @@ class EpisodeLoader:
         }
 
     def names_of(self, step: int) -> list[str]:
-        """The objects of the step after so many, different while there are enough: to render, then for reference."""
+        """The objects of a step (the first is 0), different while there are enough: to render, then for reference."""
         config, generator = self.config, step_generator(self.config.seed, step)
         count = config.tasks + reference_objects(self.model.config, config)
         if config.views:

@@ -121,6 +121,10 @@ def test_the_authors_loader_finds_what_it_reads(tmp_path):
     assert abs(original.rig.intrinsics[0, 0, 0] - 277.77) < 1e-9
     data = open_dataset(tmp_path)  # the manifest has names with underscores
     assert {data.class_of(name) for name in data.names()} == {"car"}
+    assert data.skipped == ()
+    path.unlink()
+    lines = open_dataset(tmp_path).skipped
+    assert lines == (f"{tmp_path}/manifest.json: skipped 1 of 1 objects of test without an archive, as car-test-00000",)
     assert 2.0 < original.rig.near < original.rig.far < 6.0
 
 

@@ -38,9 +38,9 @@ def read_polycam(folder: Path, root: Path) -> Listing:
     """The posed pictures of a capture of Polycam, unzipped.
 
     keyframes/corrected_cameras/N.json and corrected_images/N.jpg, which are there once the app has processed the
-    capture, else cameras and images. t_ij is row i, column j of the pose, camera to world in OpenGL's axes; the world
-    is ARKit's, y up. Principal points count from the corner of the picture, as in ARKit. Masks may lie in masks/ beside
-    the photographs' folder, or beside keyframes/. (Layout: nerfstudio, process_data/polycam_utils.py.)
+    capture, otherwise cameras and images. t_ij is row i, column j of the pose, camera to world in OpenGL's axes; the
+    world is ARKit's, y up. Principal points count from the corner of the picture, as in ARKit. Masks may lie in masks/
+    beside the photographs' folder, or beside keyframes/. (Layout: nerfstudio, process_data/polycam_utils.py.)
 
     Returns:
         The pictures in the order of their names.
