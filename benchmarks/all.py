@@ -72,7 +72,7 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
         ["--objects", "5", "--query", "2", "--counts", "2", "3", "5", "12", "--rotated", "33"]
         + ["--methods", "hull_blend", "hull_blend_reflected", "unreflected", "unrotated"],
     ),
-    "views_tuned": (["procedural", "cc0", "random"], ["--objects", "10", *_TUNED]),
+    "views_tuned": (["procedural", "cc0", "random"], ["--objects", "10", "--seeds", "3", *_TUNED]),
     "views_tuned_posed": (["posed"], ["--seeds", "5", *_TUNED]),
 }
 """Results of `views` by suites below --root, and its options, in place of `views` by --data."""
