@@ -23,7 +23,7 @@ from data_gen.meshes.files import MeshError
 from data_gen.meshes.materials import DEFAULT_COLOUR
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.mtl import MtlMaterial, decode_text, find_material, read_materials
-from data_gen.meshes.triangulate import retriangulate
+from data_gen.meshes.triangulate import TOO_FEW_CORNERS, retriangulate
 
 __all__ = ["read_obj"]
 
@@ -143,7 +143,7 @@ def _add_face(
 ) -> None:
     corners = rest.split()
     if len(corners) < 3:
-        skipped["faces with fewer than 3 corners left out"] += 1
+        skipped[TOO_FEW_CORNERS] += 1
         return
     known = group.corners
     try:
