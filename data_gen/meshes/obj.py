@@ -127,11 +127,11 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
 
 
 def _lines(text: str) -> Any:
-    """Number and content of each statement; continued lines are joined, comments removed."""
-    if "\\\n" in text:
-        text = text.replace("\\\n", " ")
-    for number, line in enumerate(text.split("\n"), 1):
-        line = line.strip()
+    """Each statement and the number of its first line; continued lines are joined, comments removed."""
+    following = 1
+    for line in text.replace("\\\n", "\r").split("\n"):  # no other \r is left in the text
+        number, following = following, following + 1 + line.count("\r")
+        line = line.replace("\r", " ").strip()
         if "#" in line and not line.startswith(_NAMES):  # a name may hold one
             line = line.partition("#")[0].rstrip()
         if line:
