@@ -18,6 +18,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.adaptation.base import Renderable
+from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.export.animation import choose_representation
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
@@ -145,7 +146,7 @@ def save_images(
     Args:
         images: RGB in [0, 1].
         folder: made where absent.
-        names: of the files, without ending; folders in them are dropped. Numbers where absent.
+        names: of the files; their folders and the endings of image files are dropped. Numbers where absent.
 
     Returns:
         The files. Names that are not one an image are a ValueError.
@@ -162,7 +163,7 @@ def picture_paths(count: int, folder: Path, names: Sequence[str] = ()) -> list[P
     Args:
         count: of pictures.
         folder: that holds them.
-        names: of files, whose ending and folders are dropped.
+        names: of files, whose folders and endings of image files are dropped.
 
     Returns:
         Paths of PNGs.
@@ -172,7 +173,8 @@ def picture_paths(count: int, folder: Path, names: Sequence[str] = ()) -> list[P
     """
     if names and len(names) != count:
         raise ValueError(f"names: expected {count}, one an image, got {len(names)}")
-    stems = [Path(name).stem for name in names]
+    paths = [Path(name) for name in names]
+    stems = [path.stem if path.suffix.lower() in PICTURE_SUFFIXES else path.name for path in paths]
     if len(set(stems)) != count:
         stems = [f"{index:04d}" for index in range(count)]
     return [folder / f"{stem}.png" for stem in stems]

@@ -237,6 +237,10 @@ def test_images_are_written_as_they_are(tmp_path):
     images = torch.rand(3, 3, 4, 5)
     paths = save_images(images, tmp_path / "new", ("a/x.png", "a/y.png", "b/z"))
     assert [path.name for path in paths] == ["x.png", "y.png", "z.png"]
+    assert [path.name for path in save_images(images[:2], tmp_path, ("t_0.25", "t_0.50"))] == [
+        "t_0.25.png",
+        "t_0.50.png",
+    ]
     with Image.open(paths[1]) as image:
         np.testing.assert_array_equal(np.asarray(image), to_pixels(images)[1])
     assert [path.name for path in save_images(images, tmp_path, ("a/x.png", "b/x.png", "c"))][0] == "0000.png"
