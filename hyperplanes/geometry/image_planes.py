@@ -115,12 +115,12 @@ class ImagePlanes:
         Raises:
             ValueError: images of another number or size.
         """
-        images = as_images(images)
+        given, images = images, as_images(images)
         if (len(images), *images.shape[2:]) != (len(self), *self.images.shape[2:]):
             expected = f"({len(self)}, channel, {self.images.shape[2]}, {self.images.shape[3]})"
             raise ValueError(f"images: expected shape {expected}, got {tuple(images.shape)}")
         result = copy.copy(self)
-        result.images, result.exact, result.masked = images.contiguous(), True, None
+        result.images, result.exact, result.masked = _counting(images.contiguous(), given), True, None
         vars(result).pop("_kept_packed", None)
         return result
 

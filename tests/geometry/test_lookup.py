@@ -316,10 +316,10 @@ def test_what_does_not_count_its_changes_is_copied():
         for other in (eight, last.permute(0, 3, 1, 2)):  # which become other tensors on the way
             assert ImagePlanes(other, ours).lookup(points).colours.shape == expected.shape
     array = images.numpy().copy()
-    planes = ImagePlanes(array, ours)
-    before = [planes.lookup(points).colours, planes.lookup(points.double()).colours]
+    made = [ImagePlanes(array, ours), ImagePlanes(1 - images, ours).with_images(array)]
+    before = [planes.lookup(where).colours for planes in made for where in (points, points.double())]
     array[:] = 1.0
-    after = [planes.lookup(points).colours, planes.lookup(points.double()).colours]
+    after = [planes.lookup(where).colours for planes in made for where in (points, points.double())]
     assert all(torch.equal(*each) for each in zip(before, after, strict=True))
 
 
