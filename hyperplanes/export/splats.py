@@ -113,7 +113,7 @@ def fit_splats(
     Args:
         splats: where it starts.
         views: posed images of the object, without lens distortion.
-        guide: renderings of the voxels from other places, from `render_guide`, which are views like the others.
+        guide: renderings of the voxels from other places, `render_guide(..., size=views.size)`; views like the others.
         steps: gradient steps.
         seed: of the order of the views.
         on_step: told the number of steps done.
@@ -128,7 +128,10 @@ def fit_splats(
         found = "some with it" if len(views) else "none"
         raise ValueError(f"views: expected at least one without lens distortion, got {found}")
     if guide is not None and guide.size != views.size:
-        raise ValueError(f"guide: expected renderings of the views' size {views.size}, got {guide.size}")
+        raise ValueError(
+            f"guide: expected renderings of the views' size {views.size}, got {guide.size}; "
+            "make them by render_guide(..., size=views.size)"
+        )
     if not steps:
         return splats
     views = views.to("cpu", torch.float32)

@@ -44,7 +44,8 @@ def render_guide(
     Args:
         source: the field that voxels were baked from, or the voxels that splats are made of.
         views: posed images that it was adapted to.
-        size: height and width of the renderings; half those of the views where absent.
+        size: height and width of the renderings; half those of the views where absent, but `fit_splats` needs
+            `views.size`.
 
     Returns:
         Sixteen views, as far from the object as the given ones; None where these are sixteen or more.
