@@ -112,7 +112,12 @@ def fibonacci_sphere(views: Count, distance: float, lowest: float = -1.0, highes
 
     Returns:
         (view, 4, 4) poses in the order of a golden-angle spiral from `highest` to `lowest`.
+
+    Raises:
+        ValueError: sines out of order or outside [-1, 1].
     """
+    if not -1 <= lowest <= highest <= 1:
+        raise ValueError(f"lowest, highest: expected -1 <= lowest <= highest <= 1, got {lowest} and {highest}")
     fraction = (torch.arange(views) + 0.5) / views
     height = highest + (lowest - highest) * fraction
     azimuth = torch.arange(views) * (math.pi * (3 - math.sqrt(5)))
