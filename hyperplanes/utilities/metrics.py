@@ -26,10 +26,13 @@ def psnr(
     return -10 * torch.log10((predicted - truth).square().flatten(1).mean(1))
 
 
+@checked
 def pooled_psnr(
     predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
 ) -> Float[Tensor, ""]:
     """PSNR in dB of the squared error of all images together; never above the mean of `psnr`.
+
+    Images of different shapes are a ValueError.
 
     >>> truth = torch.zeros(2, 3, 4, 4)
     >>> pooled_psnr(truth + torch.tensor([0.1, 0.0]).view(2, 1, 1, 1), truth).round(decimals=2).item()
@@ -39,6 +42,7 @@ def pooled_psnr(
     return -10 * torch.log10((predicted - truth).square().mean())
 
 
+@checked
 def foreground_psnr(
     predicted: Float[Tensor, "view 3 height width"],
     truth: Float[Tensor, "view 3 height width"],
@@ -48,11 +52,17 @@ def foreground_psnr(
 
     Background that both leave white counts for nothing here, so it does not depend on how much of it there is.
 
+    Raises:
+        ValueError: images of different shapes, or masks of another size or number.
+
     >>> truth, masks = torch.zeros(1, 3, 2, 2), torch.tensor([[[[1.0, 0.0], [0.0, 0.0]]]])
     >>> foreground_psnr(truth + torch.tensor([[0.1, 1.0], [1.0, 1.0]]), truth, masks).round(decimals=2).tolist()
     [20.0]
     """
     _check(predicted, truth)
+    expected = (len(truth), 1, *truth.shape[2:])
+    if masks.shape != expected:
+        raise ValueError(f"masks: expected one an image, {expected}, got {tuple(masks.shape)}")
     inside = (masks > 0.5).to(truth)
     error = ((predicted - truth).square().mean(1, keepdim=True) * inside).flatten(1).sum(1)
     return -10 * torch.log10(error / inside.flatten(1).sum(1))
