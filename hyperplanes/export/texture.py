@@ -20,6 +20,8 @@ from hyperplanes.export.mesh import Surface
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.against import fading, margins
 from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.files import format_of
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
@@ -200,6 +202,7 @@ def _spread(
     return np.round(texture[tuple(np.asarray(nearest))] * 255).astype(np.uint8)
 
 
+@checked
 def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
     """Write a textured surface as GLB with normals and an unlit material, which every viewer shows as photographed.
 
@@ -207,10 +210,10 @@ def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
 
     Args:
         mesh: what to write.
-        path: of the file.
+        path: ends in .glb.
 
     Returns:
-        The file.
+        The file. Another ending is a ValueError.
     """
     import trimesh
     from PIL import Image
@@ -218,6 +221,8 @@ def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
+    path = Path(path)
+    format_of(path, ("glb",))
     material = PBRMaterial(baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0)
     visual = TextureVisuals(uv=mesh.places, material=material)
     solid = trimesh.Trimesh(
@@ -231,6 +236,5 @@ def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
     buffer = io.BytesIO()
     scene = trimesh.Scene(solid)
     buffer.write(export_glb(scene, include_normals=True, tree_postprocessor=unlit))
-    path = Path(path)
     write_whole(path, buffer.getvalue())
     return path
