@@ -125,7 +125,7 @@ def _entry(hint: Any, value: Any, path: str) -> Any:
         if not isinstance(chosen, str) or chosen not in kinds:
             raise SettingsError(path, f"{tag}: expected one of {', '.join(kinds)}, got {kind_of(chosen)}")
         return _dataclass(kinds[chosen], {name: entry for name, entry in entries.items() if name != tag}, path)
-    for part in get_args(hint) if NoneType in get_args(hint) else (hint,):
+    for part in _kinds(hint):
         if is_dataclass(part):
             return _dataclass(part, value, path)
     value = _converted(hint, value)
@@ -139,8 +139,14 @@ def _entry(hint: Any, value: Any, path: str) -> Any:
 
 def _converted(hint: Any, value: Any) -> Any:
     """A list as a tuple, whose elements are of one type, and a whole number as a real one, where these are expected."""
-    if get_origin(hint) is tuple and isinstance(value, list):
-        return tuple(_converted(get_args(hint)[0], each) for each in value)
-    if hint in (float, float | None) and type(value) is int and abs(value) < 2**63:
-        return float(value)
+    for part in _kinds(hint):
+        if get_origin(part) is tuple and isinstance(value, list):
+            return tuple(_converted(get_args(part)[0], each) for each in value)
+        if part is float and type(value) is int and abs(value) < 2**63:
+            return float(value)
     return value
+
+
+def _kinds(hint: Any) -> tuple[Any, ...]:
+    """The parts of a union with None; any other annotation alone."""
+    return get_args(hint) if NoneType in get_args(hint) else (hint,)
