@@ -21,6 +21,7 @@ from hyperplanes.adaptation.base import Renderable
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.export.animation import choose_representation
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.encoding import encode_png
@@ -198,8 +199,8 @@ def orbit_cameras(
 ) -> PinholeCamera:
     """Cameras on a level circle around what the views show, as far away and with the lens of one of them.
 
-    Where the views have masks, the cameras stand further back if the visual hull would not fit into their pictures, as
-    after close-ups that the border cuts.
+    Where the views have masks and no lens distortion, the cameras stand further back if the visual hull would not fit
+    into their pictures, as after close-ups that the border cuts.
 
     Args:
         views: posed images of the object.
@@ -250,7 +251,7 @@ def orbit_cameras(
 
 def _stepped_back(pose: Tensor, lens: PinholeCamera, views: Views) -> Tensor:
     """Poses (camera from world) moved back along their axes, all alike, until the pictures show the visual hull."""
-    if views.masks is None:
+    if views.masks is None or isinstance(views.cameras, DistortedCamera):
         return pose
     hull = carve(views.masks, views.cameras, views.bounds, FRAMED)
     points = hull.centres().to(pose)

@@ -17,6 +17,7 @@ from hyperplanes.export.mesh import Surface, density_grid, extract_mesh, save_me
 from hyperplanes.export.mesh_filling import fill_hidden
 from hyperplanes.export.mesh_level import Agreement, agreement, choose_level
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera, distorted
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering.renderer import RayMarching
@@ -217,6 +218,17 @@ def test_an_orbit_after_close_ups_stands_back_until_the_object_fits(distance, mo
     pixels = orbit.project(surface.expand(8, 500, 3))
     assert float(pixels.min()) > 0
     assert float(pixels.max()) < 47
+
+
+def test_an_orbit_through_a_lens_stands_where_views_without_masks_put_it(tmp_path):
+    bare = views()
+    lens = distorted(bare.cameras, torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0]))
+    seen = Views(bare.images, lens, torch.ones(6, 1, 16, 16), bounds=BOUNDS)
+    orbit = orbit_cameras(seen, 4)
+    assert isinstance(orbit, DistortedCamera)
+    assert torch.equal(orbit.distortion, lens.distortion[:4])
+    assert torch.equal(orbit.extrinsics, orbit_cameras(bare, 4).extrinsics)
+    save_turntable(ball(), seen, tmp_path / "turn.webp", frames=2)
 
 
 @pytest.mark.parametrize("kind", ["webp", "gif"])
