@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
 import drawn_parts
 import numpy as np
@@ -73,10 +74,9 @@ def _over_white(rgba):
     return rgba[..., :3] * alpha + 255.0 * (1.0 - alpha)
 
 
-@pytest.mark.parametrize("resolution", [64, (200, 120)])
-def test_convention_spheres_are_where_kornia_projects_them(backend, resolution):
+@pytest.mark.parametrize("rig", [rigs.fixed(5, 64), replace(rigs.fixed(5, 120), width=200)])
+def test_convention_spheres_are_where_kornia_projects_them(backend, rig):
     # The image of a small sphere is an ellipse whose centroid differs from the centre's projection by O(radius^2).
-    rig = rigs.fixed(5, resolution)
     centres = np.array([[0.0, 0.0, 0.0], [0.5, 0.3, -0.2], [-0.4, -0.5, 0.4], [0.1, 0.6, 0.5]])
     expected = _kornia_pixels(rig, centres)
     with MeshRenderer(backend, supersample=8) as renderer:
@@ -178,7 +178,7 @@ def test_osmesa_and_embree_agree(tricky_by_embree, tmp_path):
 def test_same_bytes_in_every_run_and_process(backend, drawn_elsewhere):
     first = draw_tricky(backend)
     with MeshRenderer(backend) as renderer:
-        renderer.render([sheet()], _front_rig((31, 17)))
+        renderer.render([sheet()], replace(_front_rig(17), width=31))
     assert np.array_equal(first, draw_tricky(backend))
     assert np.array_equal(first, drawn_elsewhere[backend])
 
@@ -320,7 +320,7 @@ def test_geometry_lies_on_the_mesh_to_a_hundredth_of_a_pixel():
     pose = trimesh.transformations.translation_matrix([0.1, -0.2, 0.3]) @ np.diag([1.0, 1.3, 0.7, 1.0])
     mesh = placed(trimesh.creation.icosphere(2, radius=0.6), pose)
     mesh.metadata["smooth"] = False
-    rig = rigs.fixed(3, (50, 40))
+    rig = replace(rigs.fixed(3, 40), width=50)
     with MeshRenderer("embree", supersample=1) as renderer:
         out = renderer.render([mesh], rig, channels=CHANNELS)
     x, y = np.meshgrid(np.arange(50), np.arange(40))
