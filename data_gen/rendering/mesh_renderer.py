@@ -1,8 +1,8 @@
-"""Renders meshes from the cameras of a rig into RGBA, depth, normals, coordinates and mask.
+"""Renders meshes from the cameras of a rig into RGBA, depth, normals and coordinates.
 
 Pictures are RGBA with straight (not premultiplied) alpha: `rgb * a + white * (1 - a)` composites over white without
 dark fringes. They are drawn over black at a multiple of the resolution, averaged while premultiplied, and divided by
-their alpha at the end. Depth, normals, coordinates and mask are not averaged: they are those of the pixel's centre.
+their alpha at the end. Depth, normals and coordinates are not averaged: they are those of the pixel's centre.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from data_gen.rigs import Rig
 
 __all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "RenderError", "Rendering", "ViewRenderer"]
 
-CHANNELS = ("rgba", "depth", "normals", "coordinates", "mask")
+CHANNELS = ("rgba", "depth", "normals", "coordinates")
 """What render can return."""
 
 MAX_SUPERSAMPLE = 8
@@ -35,20 +35,20 @@ MAX_SUPERSAMPLE = 8
 class Rendering:
     """Pictures of one object. Channels that were not requested are None; empty pixels are 0 in every channel.
 
+    Geometry is that of the first surface at the pixel's centre that is at least half opaque.
+
     Attributes:
         rgba: colours uint8 `(view, height, width, 4)`, sRGB, straight alpha.
         depth: distance along the camera's z axis float32 `(view, height, width)`, world units.
         normals: unit normals towards the camera float32 `(view, height, width, 3)`, world axes, as they are shaded:
             interpolated on what is smooth, the face's own elsewhere.
         coordinates: points on the surface float32 `(view, height, width, 3)`, world units.
-        mask: whether the pixel's centre sees a surface that is at least half opaque, bool `(view, height, width)`.
     """
 
     rgba: npt.NDArray[np.uint8] | None = None
     depth: npt.NDArray[np.float32] | None = None
     normals: npt.NDArray[np.float32] | None = None
     coordinates: npt.NDArray[np.float32] | None = None
-    mask: npt.NDArray[np.bool_] | None = None
 
 
 class ViewRenderer(Protocol):
@@ -157,7 +157,7 @@ class MeshRenderer:
                 if channel in channels:
                     pictures[channel] = np.stack([getattr(view, channel) for view in views])
             if "rgba" not in channels:
-                visible = any(view.mask.any() for view in views)
+                visible = any(view.depth.any() for view in views)
         if not visible:
             raise RenderError(f"{name}: expected some of it to be visible in {len(rig)} views, found every one blank")
         return Rendering(**pictures)
