@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Protocol
 
 import numpy as np
@@ -68,10 +67,10 @@ class ViewRenderer(Protocol):
 
 
 class MeshRenderer:
-    """Draws meshes with the renderer that works here. A context manager.
+    """Draws meshes with the renderer that works here.
 
     All MeshRenderers of a process that draw with pyrender share its one renderer, so making another costs nothing; they
-    must all be used in the thread that made the first.
+    must all be used in the thread that made the first. The process keeps its OpenGL context.
 
     Args:
         renderer: the name of a renderer, or None for the best that works here.
@@ -92,22 +91,8 @@ class MeshRenderer:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, received {supersample}")
         self.name = renderer or find_renderer().name
         self.supersample = supersample
-        self._renderer: ViewRenderer | None = _make_renderer(self.name)
+        self._renderer = _make_renderer(self.name)
         self.detail = self._renderer.detail
-
-    def __enter__(self) -> MeshRenderer:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close it."""
-        self.close()
-
-    def close(self) -> None:
-        """Release the renderer. The process keeps its OpenGL context for the next MeshRenderer."""
-        self._renderer = None
 
     def render(
         self,
@@ -134,10 +119,8 @@ class MeshRenderer:
 
         Raises:
             RenderError: if the parts cannot be drawn, or nothing of them is visible in any view.
-            ValueError: if the MeshRenderer is closed, or lighting or a channel has an unknown name.
+            ValueError: if lighting or a channel has an unknown name.
         """
-        if self._renderer is None:
-            raise ValueError("renderer: expected an open one, received one that was closed")
         unknown = sorted(set(channels) - set(CHANNELS))
         if unknown or not channels:
             raise ValueError(
