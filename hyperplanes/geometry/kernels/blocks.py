@@ -14,6 +14,7 @@ from numba import njit
 
 from hyperplanes.geometry.kernels.compiling import FASTMATH
 from hyperplanes.geometry.kernels.llvm import load, read, store
+from hyperplanes.geometry.kernels.memory import BLOCK
 from hyperplanes.geometry.lookup_torch import BORDER
 
 __all__ = [
@@ -30,7 +31,6 @@ __all__ = [
     "unnormalize",
 ]
 
-BLOCK = 128
 # Rows of the scratch: pixel before clamping; 1 / z, zero behind the camera; clamped pixel; whether it is inside the
 # image; gradients with respect to the pixel; coordinates in [-1, 1], or in the backward pass their gradients; the upper
 # left one of the four pixels to interpolate, and the fractions of a pixel beyond it.

@@ -21,7 +21,7 @@ __all__ = [
     "uninitialised",
 ]
 
-BLOCK = 128  # points that the kernels take at once; `blocks.BLOCK`, which needs numba to import
+BLOCK = 128  # points that the kernels take at once
 
 
 def pitch(points: Tensor) -> int:
