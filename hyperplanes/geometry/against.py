@@ -1,4 +1,4 @@
-"""What counts against the views of a point: how far it lies behind what they see, their masks, and borders that cut."""
+"""View penalties for a point: depth behind the visible surface, incomplete masks, borders that crop the object."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
 Conventions of the whole package: OpenCV axes (x right, y down, z forward), extrinsics are camera_from_world, pixel
 (0, 0) is centred at (0, 0), so that a centred principal point is ((W - 1) / 2, (H - 1) / 2). Every function returns a
-new `PinholeCamera` with storage (view, 4, 4); none changes its argument. The functions of `poses` are names of this
-module too.
+new `PinholeCamera` with storage (view, 4, 4); none changes its argument. `look_at`, `orbit`, `fibonacci_sphere` and the
+conversions of axes of `poses` can be imported from here, too.
 """
 
 from __future__ import annotations
@@ -245,7 +245,7 @@ def _with_lens_of(cameras: PinholeCamera, bare: PinholeCamera) -> PinholeCamera:
 
 @checked
 def select(cameras: PinholeCamera, index: Selection) -> PinholeCamera:
-    """The cameras at `index`, in that order, or those for which it is True. Indices of none raise ValueError."""
+    """The cameras at `index`, in that order, or those for which it is True. An index out of range raises ValueError."""
     chosen = as_selection(index, cameras.batch_size, "cameras")
     return _rebuilt(cameras, lambda value: value[chosen])
 
@@ -300,7 +300,7 @@ def with_poses(cameras: PinholeCamera, camera_from_world: Float[Tensor, "view 4 
 @checked
 @without_autocast
 def moved(cameras: PinholeCamera, motion: Float[Tensor, "4 4"]) -> PinholeCamera:
-    """The cameras after a rigid motion of the world, in float64, which they take part in."""
+    """The cameras moved together with the world by a rigid motion (a float64 matrix)."""
     pose = camera_from_world(cameras)
     return with_poses(cameras, pose @ torch.linalg.inv(motion).to(pose))
 

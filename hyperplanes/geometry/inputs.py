@@ -230,7 +230,7 @@ def check_indices(
         from_end: negative ones count from the end.
 
     Raises:
-        ValueError: the index of none.
+        ValueError: an index out of range.
     """
     if not torch.compiler.is_compiling() and not torch._C._are_functorch_transforms_active() and values.numel():
         least, most = (int(value) for value in torch.aminmax(values))

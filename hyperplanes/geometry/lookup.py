@@ -127,7 +127,7 @@ def lookup(
 
     Raises:
         ValueError: tensors of other shapes or types, an unknown backend, one that is not available or cannot do what
-            is asked, or an index in `views` of no plane.
+            is asked, or an index in `views` that is out of range.
 
     >>> ramp = torch.arange(4.0).expand(1, 1, 4, 4)
     >>> matrix = torch.tensor([[[2.0, 0.0, 1.5, 0.0], [0.0, 2.0, 1.5, 0.0], [0.0, 0.0, 1.0, 0.0]]])

@@ -127,7 +127,7 @@ def fibonacci_sphere(views: Count, distance: float, lowest: float = -1.0, highes
 
 @without_autocast
 def outermost_first(directions: Float[Tensor, "direction 3"], count: int) -> list[int]:
-    """As `farthest_first`, from the direction on that is farthest from their mean.
+    """As `farthest_first`, starting with the direction farthest from the mean direction.
 
     Args:
         directions: unit vectors.

@@ -19,7 +19,7 @@ from hyperplanes.utilities.precision import without_autocast
 __all__ = ["SUBPIXELS", "Rays", "Sphere", "cast", "join_rays", "pixel_grid"]
 
 SUBPIXELS = ((0.0, 0.0), (-0.25, -0.25), (0.25, 0.25))
-"""Places in a pixel, from its centre, whose rays have the mean of its area as their mean, nearly: those of training."""
+"""Subpixel offsets of the rays of a training pixel; their mean colour approximates the pixel's area average."""
 
 
 @checked_fields

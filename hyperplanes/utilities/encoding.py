@@ -28,7 +28,7 @@ def encode_json(value: Any) -> bytes:
 
 
 def encode_jpeg(pixels: npt.NDArray[np.uint8], quality: int) -> bytes:
-    """JPEG bytes of (height, width, 3) pixels, of whose colours none are left out.
+    """JPEG bytes of (height, width, 3) pixels, without chroma subsampling.
 
     Args:
         pixels: the image.

@@ -30,7 +30,7 @@ def available_memory() -> int | None:
 
 
 def require_memory(what: str, found: object, needed: float, remedy: str) -> None:
-    """Refuse what does not fit into the memory that is free.
+    """Refuse what does not fit into the free memory.
 
     Args:
         what: the argument that says how much is wanted.
@@ -44,6 +44,6 @@ def require_memory(what: str, found: object, needed: float, remedy: str) -> None
     if needed <= SMALL or (free := available_memory()) is None or needed <= free:
         return
     raise ValueError(
-        f"{what}: expected what fits into the {free / 1e9:.1f} GB of memory that are free, got {found}, which takes "
+        f"{what}: expected a size that fits into the {free / 1e9:.1f} GB of free memory, got {found}, which needs "
         f"{needed / 1e9:,.0f} GB; {remedy}"
     )

@@ -1,4 +1,4 @@
-"""First weights that a seed decides, and nothing else."""
+"""Weight initialisation determined by a seed alone."""
 
 from __future__ import annotations
 

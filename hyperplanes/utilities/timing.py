@@ -1,4 +1,4 @@
-"""Seconds of what is done, and not of what is queued."""
+"""A clock that waits for queued GPU work first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wanted of tensors beside values, and no compiled kernel knows: derivatives, function transforms, graphs."""
+"""Uses of tensors that compiled kernels do not support: derivatives, function transforms, graph capture."""
 
 from __future__ import annotations
 

@@ -169,7 +169,9 @@ def _finite(value: object) -> object:
 
 
 def write_folder(folder: str | Path, files: dict[str, bytes], scratch: str | Path) -> None:
-    """Write a folder of files so that nobody ever sees half of it; a rename a file takes twice as long as writing it.
+    """Write a folder of files so that nobody ever sees half of it.
+
+    The folder is renamed once: renaming each file would take twice as long as writing it.
 
     Args:
         folder: the folder; where it exists already, its files are replaced one by one.
