@@ -28,8 +28,7 @@ class PackedImages:
 def pack(images: Float[Tensor, "view channel height width"]) -> PackedImages | None:
     """The images in the better of the two formats, or None where they cannot be packed.
 
-    Images that were 8-bit files come out exact. All others are off by at most 1/2046, a quarter of the 1/512 that the
-    lookup promises.
+    8-bit images are represented exactly, all others to within 1/2046, a quarter of the 1/512 that the lookup promises.
 
     Args:
         images: any float dtype.
