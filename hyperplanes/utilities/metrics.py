@@ -1,4 +1,4 @@
-"""How good pictures are: PSNR of each, of all, of the object alone, and SSIM."""
+"""Image metrics: PSNR of each image, of all together, of the object alone, and SSIM."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ def foreground_psnr(
     truth: Float[Tensor, "view 3 height width"],
     masks: Float[Tensor, "view 1 height width"],
 ) -> Float[Tensor, " view"]:
-    """PSNR in dB of each image where the true mask is above one half; NaN where it is nowhere.
+    """PSNR in dB of each image over the pixels whose true mask is above one half; NaN where there are none.
 
-    Background that both leave white counts for nothing here, so it does not depend on how much of it there is.
+    White background does not count, so the value does not depend on its area.
 
     Raises:
         ValueError: images of different shapes, or masks of another size or number.
@@ -72,7 +72,7 @@ def foreground_psnr(
 def ssim(
     predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
 ) -> Float[Tensor, " view"]:
-    """Structural similarity of each image: Gaussian window of 11 pixels, sigma 1.5, mean over what it fully covers.
+    """Structural similarity of each image: Gaussian window of 11 pixels, sigma 1.5, mean where it lies in the image.
 
     Equals scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)`.
 
@@ -88,7 +88,7 @@ def ssim(
 
 
 def _check(predicted: Tensor, truth: Tensor) -> None:
-    """Pictures of one shape: otherwise they would be stretched over each other without a word."""
+    """Require equal shapes: others would be broadcast silently."""
     if predicted.shape != truth.shape:
         raise ValueError(
             f"predicted: expected the shape of the truth, {tuple(truth.shape)}, got {tuple(predicted.shape)}"
