@@ -22,13 +22,13 @@ def held_out(
     rig = fixed(views, size)
     cameras = rig.cameras(dtype=torch.float32)
     tasks = []
-    with MeshRenderer() as renderer:
-        for seed in range(FIRST_SEED + first, FIRST_SEED + first + count):
-            mesh = prepare_scene(make(kind, seed), f"{kind}-{seed}")
-            pixels = torch.tensor(renderer.render(mesh_parts(mesh), rig).rgba).permute(0, 3, 1, 2)
-            pixels = pixels.contiguous().float() / 255  # as what is read from files
-            masks = pixels[:, 3:]
-            seen = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks).to(device)
-            even = torch.arange(0, views, 2)
-            tasks.append(Task(seen[even], seen[even + 1], mesh.name))
+    renderer = MeshRenderer()
+    for seed in range(FIRST_SEED + first, FIRST_SEED + first + count):
+        mesh = prepare_scene(make(kind, seed), f"{kind}-{seed}")
+        pixels = torch.tensor(renderer.render(mesh_parts(mesh), rig).rgba).permute(0, 3, 1, 2)
+        pixels = pixels.contiguous().float() / 255  # as what is read from files
+        masks = pixels[:, 3:]
+        seen = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks).to(device)
+        even = torch.arange(0, views, 2)
+        tasks.append(Task(seen[even], seen[even + 1], mesh.name))
     return tasks

@@ -149,8 +149,7 @@ def _drawn(
     if mesh is None:
         return None, -float(AXES[1])
     rig = Rig(poses, calibration, size[1], size[0], near=0.5, far=8.0)
-    with MeshRenderer() as renderer:
-        rgba = renderer.render(mesh_parts(mesh), rig).rgba
+    rgba = MeshRenderer().render(mesh_parts(mesh), rig).rgba
     assert rgba is not None
     alpha = rgba[..., 3:].astype(np.float32) / 255
     premultiplied = np.concatenate([(rgba[..., :3] * alpha).round().astype(np.uint8), rgba[..., 3:]], -1)

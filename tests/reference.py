@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import torch
 
 NEAREST = 1e-4
 BORDER = 0.01  # pixels
@@ -23,6 +24,15 @@ def bilinear(image, column, row):
     top = image[:, y, x] * (1 - fx) + image[:, y, right] * fx
     low = image[:, below, x] * (1 - fx) + image[:, below, right] * fx
     return top * (1 - fy) + low * fy
+
+
+def unpack(packed):
+    """Images (view, 3, height, width) in [0, 1] of words that hold three channels of 8, or of 11, 11 and 10 bits."""
+    channels = []
+    for first, width in ((0, 8), (8, 8), (16, 8)) if packed.bits == 8 else ((0, 11), (11, 11), (22, 10)):
+        largest = 2**width - 1
+        channels.append(((packed.words >> first) & largest).float() / largest)
+    return torch.stack(channels, 1)
 
 
 def lookup(points, matrices, images, views=None, background=1.0):

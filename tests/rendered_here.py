@@ -19,12 +19,12 @@ def run_here(target, settings, items, **_):
     module, _, function = target.partition(":")
     with warnings.catch_warnings():  # errors in tests; a worker writes them to its log
         warnings.simplefilter("default")
-        with getattr(import_module(module), function)(settings) as process:
-            for item in items:
-                answer = process_item(process, item)
-                if "fatal" in answer:
-                    raise WorkerError(answer["fatal"])
-                yield Outcome(item, answer.get("ok"), answer.get("skip"))
+        process = getattr(import_module(module), function)(settings)
+        for item in items:
+            answer = process_item(process, item)
+            if "fatal" in answer:
+                raise WorkerError(answer["fatal"])
+            yield Outcome(item, answer.get("ok"), answer.get("skip"))
 
 
 @contextmanager

@@ -48,7 +48,7 @@ def complaint(capsys):
     [
         (
             ["export", "--what", "mesh", "--voxels", "3000"],
-            "voxels: expected what fits into the .* memory .*3000",
+            "voxels: expected a size that fits into the .* memory.*3000",
         ),
         (["export", "--what", "turntable", "--size", "200000"], "cameras: expected .* got 1 of 200000x166667, which"),
         (
@@ -76,7 +76,7 @@ def test_memory_that_is_free_is_known_and_little_is_not_asked_for(monkeypatch):
     assert 0 < memory.available_memory() < 2**50
     monkeypatch.setattr(memory, "available_memory", lambda: 0)
     memory.require_memory("views", 3, memory.SMALL, "take fewer")
-    with pytest.raises(ValueError, match=r"views: expected what fits into the 0\.0 GB .* got 3, which takes 5 GB"):
+    with pytest.raises(ValueError, match=r"views: expected a size that fits .* 0\.0 GB .* got 3, which needs 5 GB"):
         memory.require_memory("views", 3, 5e9, "take fewer")
 
 

@@ -143,7 +143,7 @@ def _trial(views: Any) -> list[str]:
 
 
 def _pictures(data: Any, names: list[str]) -> tuple[list[np.ndarray], list[str]]:
-    """Views of each object, a row each; objects of other sizes than the first are left to their own."""
+    """Views of each object, a row each; objects whose views differ in size from the first one's are left out."""
     first = data.posed(names[0]).support
     pictures, labels = [], []
     for name in names:

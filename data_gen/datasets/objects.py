@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,28 +16,27 @@ from hyperplanes.utilities.writing import write_folder, write_whole
 __all__ = ["open_renderer"]
 
 
-@contextmanager
-def open_renderer(settings: dict[str, Any]) -> Generator[Callable[[dict[str, Any]], dict[str, Any]], None, None]:
+def open_renderer(settings: dict[str, Any]) -> Callable[[dict[str, Any]], dict[str, Any]]:
     """A function from an `Item`'s fields to the record of the object it wrote; one renderer serves all calls.
 
     Args:
         settings: `out`, the folder of the data set, `render`, a resolved `GenerationConfig` as JSON, and `meshes`, the
             folder that no mesh may read outside of, or None.
 
-    Yields:
+    Returns:
         The function. It raises ValueError, with the reason, for an object that cannot be drawn.
     """
     from data_gen.rendering.mesh_renderer import MeshRenderer
 
     config, out = GenerationConfig.from_json(settings["render"]), Path(settings["out"])
     meshes = None if settings["meshes"] is None else Path(settings["meshes"])
-    with MeshRenderer(config.renderer, config.supersample) as renderer:
+    renderer = MeshRenderer(config.renderer, config.supersample)
 
-        def process(fields: dict[str, Any]) -> dict[str, Any]:
-            rendered = _render(renderer, Item(**fields), config, meshes)
-            return _write(rendered, LAYOUTS[config.layout].files(rendered), out)
+    def process(fields: dict[str, Any]) -> dict[str, Any]:
+        rendered = _render(renderer, Item(**fields), config, meshes)
+        return _write(rendered, LAYOUTS[config.layout].files(rendered), out)
 
-        yield process
+    return process
 
 
 def _render(renderer: Any, item: Item, config: GenerationConfig, meshes: Path | None) -> RenderedObject:

@@ -58,12 +58,11 @@ def run_on_ray(
 
 
 class _Actor:
-    """What an actor holds: the opened target."""
+    """What an actor holds: the function that the target gives."""
 
     def __init__(self, target: str, settings: dict[str, Any]) -> None:
         module, _, function = target.partition(":")
-        self._context = getattr(import_module(module), function)(settings)
-        self._process = self._context.__enter__()
+        self._process = getattr(import_module(module), function)(settings)
 
     def answer(self, item: dict[str, Any]) -> dict[str, Any]:
         return process_item(self._process, item)

@@ -26,10 +26,10 @@ def main() -> int:
     module, _, function = sys.argv[1].partition(":")
     settings = json.loads(sys.stdin.readline() or "{}")
     try:
-        with getattr(import_module(module), function)(settings) as process:
-            answers.write(json.dumps({"ready": True}) + "\n")
-            for line in iter(sys.stdin.readline, ""):
-                answers.write(json.dumps(process_item(process, json.loads(line))) + "\n")
+        process = getattr(import_module(module), function)(settings)
+        answers.write(json.dumps({"ready": True}) + "\n")
+        for line in iter(sys.stdin.readline, ""):
+            answers.write(json.dumps(process_item(process, json.loads(line))) + "\n")
     except BrokenPipeError:
         return 1
     except Exception as error:  # the renderer cannot be made: no item can be done

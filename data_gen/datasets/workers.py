@@ -102,7 +102,7 @@ def run_isolated(
     """Process items in worker processes of this machine.
 
     Args:
-        target: "module:function"; called with the settings, it gives a context manager around a function of an item.
+        target: "module:function"; called with the settings, it gives a function of an item.
         settings: JSON-able.
         items: JSON-able; taken one by one, when a worker is free.
         workers: how many processes.

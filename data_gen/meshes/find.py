@@ -125,7 +125,7 @@ def find_meshes(
     for path in files:
         place, _ = _object_of(path)
         # in the folder of its format and beside that, too: two objects
-        twice = path not in plain and Path(*place).with_suffix(path.suffix) in plain
+        twice = path not in plain and Path(*place[:-1], place[-1] + path.suffix) in plain
         objects[path.parts if twice else place].append(path)
     taken, duplicates = [], []
     for paths in objects.values():

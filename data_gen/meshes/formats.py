@@ -19,7 +19,7 @@ from trimesh.exchange.ply import load_ply
 from data_gen.meshes.files import MeshError
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.mtl import decode_text
-from data_gen.meshes.triangulate import fan, retriangulate
+from data_gen.meshes.triangulate import TOO_FEW_CORNERS, fan, retriangulate
 
 __all__ = ["read_off", "read_ply", "read_stl"]
 
@@ -119,34 +119,41 @@ def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
             columns = elements[name]["data"]
             alpha = columns["alpha"] if "alpha" in elements[name]["properties"] else None
             loaded[keyword] = _colours(np.column_stack([columns[each] for each in ("red", "green", "blue")]), alpha)
-    if "vertices" in loaded:
-        _cut_polygons(loaded, elements, folder)
+    small = _cut_polygons(loaded, elements, folder) if "vertices" in loaded else 0
+    if small:
+        warnings.append(f"{small} {TOO_FEW_CORNERS}")
     texture = re.search(rb"^comment\s+TextureFile\s+(.+)$", data[:65536], re.MULTILINE | re.IGNORECASE)
     if texture is None or folder.lost:
         loaded.pop("visual", None)
     mesh = trimesh.Trimesh(**loaded | {"process": False})
-    if len(mesh.faces) < faces:
+    if len(mesh.faces) < faces - small:
         raise MeshError(
-            f"{folder.path}: expected {faces} faces, found {len(mesh.faces)}: the file was cut; fetch it again"
+            f"{folder.path}: expected {faces - small} faces, found {len(mesh.faces)}: the file was cut; fetch it again"
         )
     if texture and folder.lost:
         warnings.append(f"drawn without its texture {decode_text(texture.group(1)).strip()}")
     return trimesh.Scene(mesh), warnings
 
 
-def _cut_polygons(loaded: dict[str, Any], elements: dict[str, Any], folder: ModelFolder) -> None:
+def _cut_polygons(loaded: dict[str, Any], elements: dict[str, Any], folder: ModelFolder) -> int:
     """Cut the polygons of a PLY file anew where a fan is wrong, or each triangle needs the colour of its polygon.
+
+    Returns:
+        How many faces have fewer than 3 corners.
 
     Raises:
         MeshError: if a face refers to a vertex that is not there.
     """
     polygons = _ply_polygons(elements.get("face", {}).get("data"))
-    vertices = np.asarray(loaded["vertices"], dtype=np.float64)
-    if polygons is None or len(vertices) != elements["vertex"]["length"]:
-        return  # taken apart where its texture has seams
+    if polygons is None:
+        return 0
     sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
-    if sizes.max(initial=3) == 3:
-        return
+    small = int((sizes < 3).sum())
+    vertices = np.asarray(loaded["vertices"], dtype=np.float64)
+    if small == len(sizes) or (sizes == 3).all():
+        return small
+    if len(vertices) != elements["vertex"]["length"]:
+        return small  # taken apart where its texture has seams
     starts = np.cumsum(np.maximum(sizes - 2, 0)) - np.maximum(sizes - 2, 0)
     fans = [np.asarray(polygon, dtype=np.int64)[fan(len(polygon))] for polygon in polygons if len(polygon) > 2]
     triangles = np.concatenate(fans)
@@ -162,8 +169,9 @@ def _cut_polygons(loaded: dict[str, Any], elements: dict[str, Any], folder: Mode
     if colours is not None and len(colours) == len(polygons):
         loaded["face_colors"] = np.asarray(colours)[np.repeat(np.arange(len(sizes)), np.maximum(sizes - 2, 0))]
     elif (before == triangles).all():
-        return
+        return small
     loaded["faces"] = triangles
+    return small
 
 
 def _ply_polygons(data: Any) -> Any:
@@ -225,17 +233,21 @@ def _off_faces(lines: list[list[str]], positions: npt.NDArray[np.float64], warni
     triangles: list[tuple[int, int, int]] = []
     polygons: list[tuple[int, list[int]]] = []
     colours: list[list[float]] = []
+    small = 0
     for line in lines:
         size = int(line[0])
         corners = [int(word) for word in line[1 : size + 1]]
         if len(corners) != size or not all(0 <= corner < vertex_count for corner in corners):
             raise ValueError(" ".join(line)[:60])
         colour = [float(word) for word in line[size + 1 : size + 5]]
+        small += size < 3
         if size > 3:
             polygons.append((len(triangles), corners))
         for index in range(1, size - 1):
             triangles.append((corners[0], corners[index], corners[index + 1]))
             colours.append(colour)
+    if small:
+        warnings.append(f"{small} {TOO_FEW_CORNERS}")
     widths = {len(colour) for colour in colours}
     usable = widths in ({3}, {4})
     if not usable and widths - {0}:

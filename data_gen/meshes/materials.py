@@ -56,7 +56,7 @@ _MAP_SLOTS = ("metallicRoughnessTexture", "normalTexture", "occlusionTexture", "
 Visual = ColorVisuals | TextureVisuals
 
 Wrap = Literal["repeat", "clamp", "mirror"]
-"""How a texture goes on outside [0, 1]."""
+"""Wrap mode of a texture."""
 
 
 class DrawnMaterial(PBRMaterial):
@@ -64,8 +64,8 @@ class DrawnMaterial(PBRMaterial):
 
     Attributes:
         unlit: whether its base colour is seen as it is, whatever the light.
-        wrap: how its base colour texture goes on outside [0, 1], along u and along v.
-        emissive_wrap: the same of its emissive texture.
+        wrap: wrap mode of its base colour texture along u and along v.
+        emissive_wrap: that of its emissive texture.
     """
 
     unlit: bool = False

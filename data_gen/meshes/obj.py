@@ -23,7 +23,7 @@ from data_gen.meshes.files import MeshError
 from data_gen.meshes.materials import DEFAULT_COLOUR
 from data_gen.meshes.model_folder import ModelFolder
 from data_gen.meshes.mtl import MtlMaterial, decode_text, find_material, read_materials
-from data_gen.meshes.triangulate import retriangulate
+from data_gen.meshes.triangulate import TOO_FEW_CORNERS, retriangulate
 
 __all__ = ["read_obj"]
 
@@ -127,11 +127,11 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
 
 
 def _lines(text: str) -> Any:
-    """Number and content of each statement; continued lines are joined, comments removed."""
-    if "\\\n" in text:
-        text = text.replace("\\\n", " ")
-    for number, line in enumerate(text.split("\n"), 1):
-        line = line.strip()
+    """Each statement and the number of its first line; continued lines are joined, comments removed."""
+    following = 1
+    for line in text.replace("\\\n", "\r").split("\n"):  # no other \r is left in the text
+        number, following = following, following + 1 + line.count("\r")
+        line = line.replace("\r", " ").strip()
         if "#" in line and not line.startswith(_NAMES):  # a name may hold one
             line = line.partition("#")[0].rstrip()
         if line:
@@ -143,7 +143,7 @@ def _add_face(
 ) -> None:
     corners = rest.split()
     if len(corners) < 3:
-        skipped["faces with fewer than 3 corners left out"] += 1
+        skipped[TOO_FEW_CORNERS] += 1
         return
     known = group.corners
     try:

@@ -132,7 +132,7 @@ def read_split_file(path: Path) -> dict[tuple[str, str], str]:
                     raise MeshError(
                         f"{path}: line {rows.line_num}: expected train, val or test, found {name!r}; correct the line"
                     )
-                split[row["synsetId"].strip().zfill(8), (row["modelId"] or "").strip()] = _SPLITS[name]
+                split[(row["synsetId"] or "").strip().zfill(8), (row["modelId"] or "").strip()] = _SPLITS[name]
     except DataError as error:
         raise MeshError(str(error)) from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:

@@ -8,7 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from mapbox_earcut import triangulate_float64
 
-__all__ = ["concave", "fan", "retriangulate", "triangulate"]
+__all__ = ["TOO_FEW_CORNERS", "concave", "fan", "retriangulate", "triangulate"]
+
+TOO_FEW_CORNERS = "faces with fewer than 3 corners left out"
+"""The warning about such faces, after their number."""
 
 _FLAT = 1e-3  # sine of an angle that counts as straight
 

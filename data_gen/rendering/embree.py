@@ -2,7 +2,7 @@
 
 Colours follow `shading`, the formula of the OpenGL shader, at the same sample positions, so the two renderers differ by
 rounding, by how they choose a texture's level, and in the order of translucent faces where OpenGL's, by their centres,
-is not that along the ray. Geometry (depth, normals, coordinates, mask) is always cast, whatever draws the colours: at
+is not that along the ray. Geometry (depth, normals, coordinates) is always cast, whatever draws the colours: at
 exact pixel centres and in double precision, where a depth buffer has 24 bits that are spread unevenly.
 """
 
@@ -38,13 +38,11 @@ class Geometry:
         depth: distance along the camera's z axis, float32 `(height, width)`.
         normals: unit normals towards the camera, world axes, float32 `(height, width, 3)`.
         coordinates: points on the surface, world units, float32 `(height, width, 3)`.
-        mask: whether there is a surface, bool `(height, width)`.
     """
 
     depth: npt.NDArray[np.float32]
     normals: npt.NDArray[np.float32]
     coordinates: npt.NDArray[np.float32]
-    mask: npt.NDArray[np.bool_]
 
 
 class EmbreeRenderer:
@@ -53,7 +51,6 @@ class EmbreeRenderer:
     def __init__(self) -> None:
         import embreex
 
-        self.name = "embree"
         self.detail = f"Embree ray casting, embreex {getattr(embreex, '__version__', 'of unknown version')}"
 
     def draw(
@@ -100,7 +97,6 @@ def cast_geometry(surfaces: Sequence[ShadedSurface], rig: Rig) -> Iterator[Geome
             depth.reshape(shape).astype(np.float32),
             normals.reshape(*shape, 3).astype(np.float32),
             coordinates.reshape(*shape, 3).astype(np.float32),
-            (depth > 0.0).reshape(shape),
         )
 
 

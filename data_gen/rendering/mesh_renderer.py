@@ -1,15 +1,14 @@
-"""Renders meshes from the cameras of a rig into RGBA, depth, normals, coordinates and mask.
+"""Renders meshes from the cameras of a rig into RGBA, depth, normals and coordinates.
 
 Pictures are RGBA with straight (not premultiplied) alpha: `rgb * a + white * (1 - a)` composites over white without
 dark fringes. They are drawn over black at a multiple of the resolution, averaged while premultiplied, and divided by
-their alpha at the end. Depth, normals, coordinates and mask are not averaged: they are those of the pixel's centre.
+their alpha at the end. Depth, normals and coordinates are not averaged: they are those of the pixel's centre.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +23,7 @@ from data_gen.rigs import Rig
 
 __all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "RenderError", "Rendering", "ViewRenderer"]
 
-CHANNELS = ("rgba", "depth", "normals", "coordinates", "mask")
+CHANNELS = ("rgba", "depth", "normals", "coordinates")
 """What render can return."""
 
 MAX_SUPERSAMPLE = 8
@@ -35,20 +34,20 @@ MAX_SUPERSAMPLE = 8
 class Rendering:
     """Pictures of one object. Channels that were not requested are None; empty pixels are 0 in every channel.
 
+    Geometry is that of the first surface at the pixel's centre that is at least half opaque.
+
     Attributes:
         rgba: colours uint8 `(view, height, width, 4)`, sRGB, straight alpha.
         depth: distance along the camera's z axis float32 `(view, height, width)`, world units.
         normals: unit normals towards the camera float32 `(view, height, width, 3)`, world axes, as they are shaded:
             interpolated on what is smooth, the face's own elsewhere.
         coordinates: points on the surface float32 `(view, height, width, 3)`, world units.
-        mask: whether the pixel's centre sees a surface that is at least half opaque, bool `(view, height, width)`.
     """
 
     rgba: npt.NDArray[np.uint8] | None = None
     depth: npt.NDArray[np.float32] | None = None
     normals: npt.NDArray[np.float32] | None = None
     coordinates: npt.NDArray[np.float32] | None = None
-    mask: npt.NDArray[np.bool_] | None = None
 
 
 class ViewRenderer(Protocol):
@@ -68,10 +67,10 @@ class ViewRenderer(Protocol):
 
 
 class MeshRenderer:
-    """Draws meshes with the renderer that works here. A context manager.
+    """Draws meshes with the renderer that works here.
 
     All MeshRenderers of a process that draw with pyrender share its one renderer, so making another costs nothing; they
-    must all be used in the thread that made the first.
+    must all be used in the thread that made the first. The process keeps its OpenGL context.
 
     Args:
         renderer: the name of a renderer, or None for the best that works here.
@@ -92,22 +91,8 @@ class MeshRenderer:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, received {supersample}")
         self.name = renderer or find_renderer().name
         self.supersample = supersample
-        self._renderer: ViewRenderer | None = _make_renderer(self.name)
+        self._renderer = _make_renderer(self.name)
         self.detail = self._renderer.detail
-
-    def __enter__(self) -> MeshRenderer:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close it."""
-        self.close()
-
-    def close(self) -> None:
-        """Release the renderer. The process keeps its OpenGL context for the next MeshRenderer."""
-        self._renderer = None
 
     def render(
         self,
@@ -134,10 +119,8 @@ class MeshRenderer:
 
         Raises:
             RenderError: if the parts cannot be drawn, or nothing of them is visible in any view.
-            ValueError: if the MeshRenderer is closed, or lighting or a channel has an unknown name.
+            ValueError: if lighting or a channel has an unknown name.
         """
-        if self._renderer is None:
-            raise ValueError("renderer: expected an open one, received one that was closed")
         unknown = sorted(set(channels) - set(CHANNELS))
         if unknown or not channels:
             raise ValueError(
@@ -157,7 +140,7 @@ class MeshRenderer:
                 if channel in channels:
                     pictures[channel] = np.stack([getattr(view, channel) for view in views])
             if "rgba" not in channels:
-                visible = any(view.mask.any() for view in views)
+                visible = any(view.depth.any() for view in views)
         if not visible:
             raise RenderError(f"{name}: expected some of it to be visible in {len(rig)} views, found every one blank")
         return Rendering(**pictures)

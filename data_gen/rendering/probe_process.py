@@ -32,17 +32,15 @@ def draw_test_image(name: str) -> str:
     sheet.visual = ColorVisuals(sheet, vertex_colors=[[255, 0, 0, 255]] * 4)
     intrinsics = np.array([[16.0, 0.0, 7.5], [0.0, 16.0, 7.5], [0.0, 0.0, 1.0]])
     rig = Rig(look_at_origin([[0.0, 0.0, 2.0]]), intrinsics, 16, 16, 1.0, 3.0)
-    with MeshRenderer(name) as renderer:
-        drawn = renderer.render([sheet], rig)
-        picture = np.asarray(drawn.rgba)[0].astype(int)
-        detail = renderer.detail
+    renderer = MeshRenderer(name)
+    picture = np.asarray(renderer.render([sheet], rig).rgba)[0].astype(int)
     left, right = picture[:, :8], picture[:, 8:]
     red = (left[..., 3] == 255) & (left[..., 0] > 40) & (left[..., 0] > 2 * left[..., 1])
     if not red.all() or right[..., 3].any():
         raise RendererError(
             f"expected a red left half, received {left[8, 4].tolist()} there, and alpha {right[..., 3].max()} outside"
         )
-    return detail
+    return renderer.detail
 
 
 if __name__ == "__main__":

@@ -37,7 +37,6 @@ class PyrenderRenderer:
     """
 
     def __init__(self, platform: str) -> None:
-        self.name = f"pyrender-{platform}"
         self._renderer = _shared_renderer(platform)
         from OpenGL import GL
 

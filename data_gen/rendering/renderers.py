@@ -124,8 +124,7 @@ def find_renderer(prefer: str | None = None) -> RendererInfo:
     for name in RENDERERS:
         outcome = probe(name)
         if outcome.works:
-            advice = () if name.startswith("pyrender") else tuple(_advice(failure) for failure in failures)
-            return RendererInfo(name, outcome.message, advice)
+            return RendererInfo(name, outcome.message, tuple(_advice(failure) for failure in failures))
         failures.append(outcome)
     raise RendererError(
         f"no renderer works here ({'; '.join(f'{f.name}: {f.message}' for f in failures)}). "

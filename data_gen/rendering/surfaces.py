@@ -86,8 +86,8 @@ class ShadedSurface:
         emissive: linear RGB `(3,)` that is added to the reflected light.
         emissive_texture: like texture, multiplies emissive.
         emissive_uv: its coordinates where they are not `uv`; else None.
-        wrap: how the texture goes on outside [0, 1], along u and along v.
-        emissive_wrap: the same of emissive_texture.
+        wrap: wrap mode of the texture along u and along v.
+        emissive_wrap: that of emissive_texture.
         roughness: in [MIN_ROUGHNESS, 1].
         metallic: in [0, MAX_METALLIC].
         cutoff: alpha below this is transparent, from it on opaque (glTF MASK); None for alpha that blends.

@@ -21,7 +21,7 @@ class MipmappedTexture:
 
     Args:
         texels: uint8 `(height, width, 4)`, first row on top.
-        wrap: how it goes on outside [0, 1], along u and along v.
+        wrap: wrap mode along u and along v.
     """
 
     def __init__(self, texels: npt.NDArray[np.uint8], wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")) -> None:

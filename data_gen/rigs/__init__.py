@@ -84,10 +84,10 @@ def make_rig(
     Args:
         name: one of RIGS; of a preset only the kind is taken, all its numbers are arguments here.
         views: number of views.
-        resolution: pixels along a side; `fixed`, `random`, `orbit` and `spiral` also take (width, height).
+        resolution: pixels along a side.
         seed: seed of random rigs.
         distance: distance of the cameras from the origin in world units.
-        field_of_view: full angle across the smaller side in degrees; None fits the unit sphere.
+        field_of_view: full angle in degrees; None fits the unit sphere.
 
     Returns:
         The rig.

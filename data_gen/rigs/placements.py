@@ -16,24 +16,22 @@ _SPIRAL_ANGLE = 20.0  # radians about the vertical axis from the horizon to the 
 
 def fixed(
     views: int = 50,
-    resolution: int | tuple[int, int] = 128,
+    resolution: int = 128,
     *,
     distance: float = DEFAULT_DISTANCE,
     field_of_view: float | None = None,
-    lowest: float = -20.0,
-    highest: float = 80.0,
 ) -> Rig:
     """The same well spread poses for every object.
 
-    Views with an even index (support) and with an odd index (query) are each a spherical Fibonacci spread over the band
-    of elevations, and their union is well spread too: the second spread stands half a step higher and is turned into
-    the gaps of the first. Within each half, views come in farthest-first order, so the first few are well spread as
-    well. Of 50 views, no two are nearer than 15.6 degrees, and no two of a half nearer than 29 degrees.
+    Views with an even index (support) and with an odd index (query) are each a spherical Fibonacci spread over the
+    elevations from -20 to 80 degrees, and their union is well spread too: the second spread stands half a step higher
+    and is turned into the gaps of the first. Within each half, views come in farthest-first order, so the first few are
+    well spread as well. Of 50 views, no two are nearer than 15.6 degrees, and no two of a half nearer than 29 degrees.
 
-    Elevations are from `lowest` to `highest` degrees; the other arguments are those of `make_rig`.
+    The arguments are those of `make_rig`.
     """
     _check_views(views)
-    bottom, top = _height_band(lowest, highest)
+    bottom, top = (math.sin(math.radians(elevation)) for elevation in (-20.0, 80.0))
     directions = np.empty((views, 3))
     for first in (0, 1):
         count = len(range(first, views, 2))
@@ -47,29 +45,32 @@ def fixed(
 
 def random(
     views: int = 50,
-    resolution: int | tuple[int, int] = 128,
+    resolution: int = 128,
     *,
     seed: int,
     distance: float = DEFAULT_DISTANCE,
     field_of_view: float | None = None,
     lowest: float = -90.0,
-    highest: float = 90.0,
 ) -> Rig:
-    """Cameras at random, uniformly in area over a band of elevations: the whole sphere, or the upper half of it.
+    """Cameras at random, uniformly in area over the sphere above an elevation.
 
-    Elevations are from `lowest` (0 for the upper hemisphere) to `highest` degrees; the other arguments are those of
-    `make_rig`.
+    Elevations are at least `lowest` degrees (0 for the upper hemisphere); the other arguments are those of `make_rig`.
+
+    Raises:
+        ValueError: if `lowest`, or an argument of `make_rig`, makes no sense.
     """
     _check_views(views)
+    if not -90.0 <= lowest < 90.0:
+        raise ValueError(f"lowest: expected -90 <= lowest < 90 degrees, received {lowest}")
     generator = np.random.default_rng(seed)
-    heights = generator.uniform(*_height_band(lowest, highest), views)
+    heights = generator.uniform(math.sin(math.radians(lowest)), 1.0, views)
     azimuths = generator.uniform(0.0, 2.0 * math.pi, views)
     return aimed(_directions(heights, azimuths), resolution, distance, field_of_view)
 
 
 def orbit(
     views: int = 60,
-    resolution: int | tuple[int, int] = 128,
+    resolution: int = 128,
     *,
     elevation: float = 20.0,
     distance: float = DEFAULT_DISTANCE,
@@ -93,7 +94,7 @@ def orbit(
 
 def spiral(
     views: int = 251,
-    resolution: int | tuple[int, int] = 128,
+    resolution: int = 128,
     *,
     distance: float = DEFAULT_DISTANCE,
     field_of_view: float | None = None,
@@ -119,13 +120,6 @@ def _directions(heights: Array, azimuths: Array) -> Array:
     """Unit vectors (view, 3) from y coordinates and angles about y that start at +z and turn towards +x."""
     across = np.sqrt(np.clip(1.0 - heights**2, 0.0, None))
     return np.stack((across * np.sin(azimuths), heights, across * np.cos(azimuths)), axis=-1)
-
-
-def _height_band(lowest: float, highest: float) -> tuple[float, float]:
-    """The y coordinates on the unit sphere of two elevations in degrees."""
-    if not -90.0 <= lowest < highest <= 90.0:
-        raise ValueError(f"lowest, highest: expected -90 <= lowest < highest <= 90, received {lowest} and {highest}")
-    return math.sin(math.radians(lowest)), math.sin(math.radians(highest))
 
 
 def _farthest_first(directions: Array) -> list[int]:

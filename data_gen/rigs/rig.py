@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -90,11 +90,6 @@ class Rig:
         """Return the number of views."""
         return len(self.world_from_camera)
 
-    @property
-    def camera_centres(self) -> Array:
-        """Camera positions `(view, 3)` in world units."""
-        return self.world_from_camera[:, :3, 3]
-
     def cameras(self, views: Sequence[int] | slice = slice(None), dtype: torch.dtype | None = None) -> PinholeCamera:
         """The cameras as `hyperplanes.geometry` takes them.
 
@@ -163,19 +158,15 @@ def look_at_origin(centres: npt.ArrayLike) -> Array:
     return poses + 0.0  # no negative zeros in what is written to disk
 
 
-def aimed(directions: Array, resolution: int | tuple[int, int], distance: float, field_of_view: float | None) -> Rig:
+def aimed(directions: Array, resolution: int, distance: float, field_of_view: float | None) -> Rig:
     """Cameras that look at the origin from some directions (view, 3); the other arguments are those of `make_rig`."""
-    size: Any = resolution if isinstance(resolution, tuple) else (resolution, resolution)
-    width, height = int(size[0]), int(size[1])
-    if width < 1 or height < 1:
+    if resolution < 1:
         raise ValueError(f"resolution: expected at least 1 pixel, received {resolution}")
     fitting = fitting_field_of_view(distance)
     angle = fitting if field_of_view is None else field_of_view
     if not 0.0 < angle < 180.0:
         raise ValueError(f"field_of_view: expected more than 0 and less than 180 degrees, received {field_of_view}")
-    focal = min(width, height) / 2.0 / math.tan(math.radians(angle) / 2.0)
-    intrinsics = np.array(
-        [[focal, 0.0, (width - 1) / 2.0], [0.0, focal, (height - 1) / 2.0], [0.0, 0.0, 1.0]], dtype=np.float64
-    )
+    focal, middle = resolution / 2.0 / math.tan(math.radians(angle) / 2.0), (resolution - 1) / 2.0
+    intrinsics = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
     near, far = distance - OBJECT_RADIUS, distance + OBJECT_RADIUS
-    return Rig(look_at_origin(directions * distance), intrinsics, width, height, near, far)
+    return Rig(look_at_origin(directions * distance), intrinsics, resolution, resolution, near, far)

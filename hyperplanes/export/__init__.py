@@ -1,1 +1,1 @@
-"""A field made into files: pictures, turntables, meshes and baked voxels."""
+"""Export of fields to files: images, turntables, meshes, points, splats and baked voxels."""

@@ -1,4 +1,4 @@
-"""What draws an animation of an object: its field, or voxels fitted to its views where many pictures are asked for."""
+"""The choice of what renders an animation: the field, or, for many pictures, voxels fitted to the views."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ __all__ = ["Representation", "choose_representation", "draws_by_voxels", "fitted
 Representation: TypeAlias = Literal["auto", "field", "voxels"]
 
 PIXELS = 24
-"""Of all pictures together, for each voxel of a face of the grid: from so many on baking, fitting and drawing voxels
-takes less time than drawing the field, on two cores."""
+"""Pixels of all pictures for each voxel of a face of the grid, from which on baking, fitting and rendering voxels takes
+less time than rendering the field, on two cores."""
 
 
 def draws_by_voxels(views: int, cameras: PinholeCamera, side: int) -> bool:
-    """Whether voxels draw the pictures sooner than the field, and as well: many pictures of an object of many views.
+    """Whether voxels render the pictures faster than the field, and as well: many pictures and many views.
 
     >>> import torch
     >>> poses, lens = torch.eye(4).expand(48, 4, 4), camera.symmetric_intrinsics(400, 400, 0.8)
@@ -35,7 +35,7 @@ def draws_by_voxels(views: int, cameras: PinholeCamera, side: int) -> bool:
     False
 
     Args:
-        views: how many the field was adapted to; with few of them, voxels show less than the field.
+        views: number of views that the field was adapted to; with few, voxels are worse than the field.
         cameras: of the pictures.
         side: voxels an axis.
     """
@@ -47,10 +47,10 @@ def fitted_voxels(adapted: AdaptedField, views: Views, side: int, *, steps: int 
     """The voxels of a field, fitted to its support views.
 
     Args:
-        adapted: what is baked.
+        adapted: the field to bake.
         views: its support views.
         side: voxels an axis.
-        steps: of fitting.
+        steps: gradient steps.
     """
     return fit_voxels(bake(adapted, side=side), views, guide=render_guide(adapted, views), steps=steps)
 
@@ -63,22 +63,22 @@ def choose_representation(
     *,
     make: Callable[[AdaptedField, Views, int], BakedField] = fitted_voxels,
 ) -> Renderable:
-    """What draws the pictures of an animation.
+    """The representation that renders an animation.
 
     Args:
-        field: of the object; what is no adapted field, such as baked voxels, draws itself.
+        field: of the object; anything but an `AdaptedField`, such as baked voxels, is returned as it is.
         views: its support views, to which voxels are fitted.
         cameras: of all pictures.
-        representation: "field", "voxels", or what `draws_by_voxels` says; on a GPU, where fields are drawn at once,
+        representation: "field", "voxels", or "auto" for what `draws_by_voxels` says; on a GPU, where fields are fast,
             "auto" is the field.
-        make: makes the voxels, of the field, the views and the number of voxels an axis.
+        make: makes voxels from the field, the views and the number of voxels an axis.
 
     Returns:
         The field itself, or its voxels.
     """
     if not isinstance(field, AdaptedField) or representation == "field":
         return field
-    side = default_side(views.size)  # pictures may be larger: what the views show is not, and dots would be seen
+    side = default_side(views.size)  # not by larger pictures: finer voxels than the views' pixels would show as dots
     if representation == "auto":
         on_cpu = field.occupancy.occupied.device.type == "cpu"
         if not (on_cpu and draws_by_voxels(len(views), cameras, side)):

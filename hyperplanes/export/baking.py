@@ -1,4 +1,4 @@
-"""From an adapted field to a sparse voxel grid that renders in real time: `hyperplanes bake`."""
+"""Baking of an adapted field into a sparse voxel grid that renders in real time: `hyperplanes bake`."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ __all__ = ["BakedScene", "bake", "coarsening", "default_side"]
 
 CHUNK = 1 << 12
 SIDE = 128  # voxels an axis of the grid of transmittances
-MIN_TRANSMITTANCE = 0.02  # a voxel is left out where no viewing direction reaches it with more than this
+MIN_TRANSMITTANCE = 0.02  # voxels that no viewing direction reaches with more than this are left out
 MIN_OPACITY = 0.005  # over 1/128 of the scene's diameter; voxels below it are left out
-EDGE = 0.5  # as in `render_images`: voxels cost little enough for rays through more pixels, which bring 0.1 dB
-MIN_WEIGHT = 0.01  # of a voxel in the pixel from which it is seen best; voxels below it are left out
+EDGE = 0.5  # as in `render_images`; voxels are cheap enough for extra rays in more pixels, which bring 0.1 dB
+MIN_WEIGHT = 0.01  # of a voxel in the pixel that sees it best; voxels below it are left out
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class BakedScene:
     @checked
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Pictures:
-        """The pictures of cameras on any device, by a kernel where the voxels are on a CPU, else by `RayMarching`."""
+        """The pictures of cameras on any device, by a kernel if the voxels are on the CPU, else by `RayMarching`."""
         bounds, cameras = self.field.bounds, camera.to(cameras, self.field.index.device)
         if self.field.index.device.type != "cpu":
             return self.adapted.render(cameras, self.adapted.sampling)
@@ -71,17 +71,17 @@ class BakedScene:
 
     @cached_property
     def adapted(self) -> AdaptedField:
-        """The voxels as any other field of one object."""
+        """The voxels as an `AdaptedField`."""
         return AdaptedField(self.field, self.field.occupancy, RayMarching(self.steps, STOP))
 
     @cached_property
     def grid(self) -> VoxelGrid:
-        """The voxels as rays are cast through them."""
+        """The voxels prepared for ray casting."""
         return VoxelGrid.of(self.field.index, self.field.bounds)
 
     @cached_property
     def _centres(self) -> Float[Tensor, "row 3"]:
-        """Where the voxel of each row stands."""
+        """The centre of each row's voxel."""
         return self.field.centres()
 
     def footprint(self, cameras: PinholeCamera) -> Bool[Tensor, "view height width"]:
@@ -90,7 +90,7 @@ class BakedScene:
 
     @cached_property
     def _coarse_occupancy(self) -> Occupancy:
-        """The occupancy in few large voxels: their footprint takes less time to compute than it saves."""
+        """The occupancy in few large voxels, whose footprint is cheap enough to save time."""
         return _resampled(self.field.occupancy, max(8, self.field.side // 4))
 
 
@@ -110,9 +110,9 @@ def bake(
 
     Args:
         adapted: the field of one object.
-        side: voxels an axis; two for every pixel that the object is wide lose little.
+        side: voxels an axis; two for each pixel of the object's width lose little quality.
         directions: viewing directions at which colour is evaluated.
-        on_part: told how many of how many voxels are done.
+        on_part: called with the numbers of voxels done and in total.
 
     Returns:
         The voxels, on the CPU.
@@ -129,12 +129,12 @@ def bake(
     optical_depth = torch.zeros_like(coarse.occupied, dtype=view.dtype)
     optical_depth[coarse.occupied] = _density_at(adapted, coarse.centres()) * coarse.voxel
     arriving = transmittance(optical_depth, coarse.occupied.nonzero(), view)
-    # voxels that some light reaches
+    # voxels that are visible from some direction
     visible = torch.zeros_like(coarse.occupied)
     visible[coarse.occupied] = arriving.amax(1) > MIN_TRANSMITTANCE
     row = torch.zeros(coarse.occupied.numel(), dtype=torch.long, device=view.device)
     row[coarse.occupied.flatten()] = torch.arange(len(arriving), device=view.device)
-    # density and coefficients of the fine voxels in these
+    # density and coefficients of the fine voxels in visible ones
     fine = _in_sphere(_resampled(Occupancy(visible, coarse.bounds), side))
 
     def voxels(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -151,20 +151,20 @@ def bake(
     if not sum(len(part) for part in cells):
         raise ValueError("bake: expected a field with something in it, got one that is empty everywhere")
     filled, values = torch.cat(cells), torch.cat(rows)
-    # where each voxel's row is
+    # the row of each voxel
     index = torch.full((side**3,), -1, dtype=torch.int32, device=view.device)
     index[filled] = torch.arange(len(filled), dtype=torch.int32, device=view.device)
     return BakedField(index.reshape(side, side, side).cpu(), values.cpu(), fine.bounds)
 
 
 def coarsening(side: int) -> int:
-    """How many voxels along an axis share the transmittance of one, in a field of so many an axis.
+    """Number of voxels along an axis that share one transmittance, for a field of `side` voxels an axis.
 
     Args:
         side: voxels an axis.
 
     Raises:
-        ValueError: too few, too many, or no multiple of that number.
+        ValueError: too few, too many, or not a multiple of that number.
     """
     coarser = max(2, side // SIDE)
     if side % coarser or not 8 <= side <= LARGEST_SIDE:
@@ -173,11 +173,11 @@ def coarsening(side: int) -> int:
 
 
 def default_side(size: tuple[int, int]) -> int:
-    """Voxels an axis that suit views of (height, width) once they are fitted to them: 1.4 a pixel, and at most 256.
+    """Voxels an axis that suit fitting to views of (height, width): 1.4 per pixel, at most 256.
 
-    More show less of what lies between the rays of the views' pixels. Fitted to 25 views of 64x64, new views of a
-    car, a chair and a lamp have 33.0, 31.3 and 34.5 dB by 128 voxels an axis, 32.9, 31.9 and 34.7 by 96, and 31.5,
-    31.6 and 32.2 by 64.
+    More voxels are not constrained between the rays of the views' pixels. Fitted to 25 views of 64x64, new views of a
+    car, a chair and a lamp have 33.0, 31.3 and 34.5 dB with 128 voxels an axis, 32.9, 31.9 and 34.7 with 96, and 31.5,
+    31.6 and 32.2 with 64.
 
     >>> default_side((64, 64)), default_side((100, 80)), default_side((400, 400))
     (96, 128, 256)
@@ -188,7 +188,7 @@ def default_side(size: tuple[int, int]) -> int:
 def _voxels(
     adapted: AdaptedField, points: Tensor, view: Tensor, arriving: Tensor, voxel: float
 ) -> tuple[Bool[Tensor, " point"], Float[Tensor, "filled 28"]]:
-    """Which points have density, and the density and coefficients of those."""
+    """Which points have density, and the density and coefficients of these."""
     field, length = adapted.field, adapted.occupancy.bounds.radius / 64
     hidden = field.hidden(points) if isinstance(field, SplitField) else points
     density = field.density_of(hidden) if isinstance(field, SplitField) else adapted.density(points)
@@ -204,13 +204,13 @@ def _voxels(
 
 
 def _resampled(occupancy: Occupancy, side: int) -> Occupancy:
-    """The same region in another resolution: each voxel that it touches."""
+    """The same region at another resolution: all voxels that it touches."""
     grid = torch.nn.functional.adaptive_max_pool3d(occupancy.occupied[None, None].float(), side)
     return Occupancy(grid[0, 0] > 0, occupancy.bounds)
 
 
 def _in_sphere(occupancy: Occupancy) -> Occupancy:
-    """The voxels that rays, which end at the sphere, can have samples beside."""
+    """The voxels that samples on rays, which end at the sphere, can interpolate from."""
     side = occupancy.occupied.shape[0]
     along = ((torch.arange(side, device=occupancy.occupied.device) + 0.5) * (2 / side) - 1).square()
     away = along[:, None, None] + along[:, None] + along
@@ -224,7 +224,7 @@ def _density_at(adapted: AdaptedField, points: Float[Tensor, "point 3"]) -> Floa
 def _harmonics(
     colours: Float[Tensor, "point direction 3"], view: Float[Tensor, "direction 3"], arriving: Tensor
 ) -> Float[Tensor, "point 27"]:
-    """Coefficients of colour, red first, by weighted least squares with a little ridge on all but the mean."""
+    """Colour coefficients, red first, by weighted least squares with a small ridge penalty on all but the mean."""
     basis = spherical_harmonics(view)
     weights = (arriving + 1e-3)[..., None]
     ridge = torch.full((HARMONICS,), 1e-2 * len(view), device=view.device)

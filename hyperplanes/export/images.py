@@ -1,4 +1,4 @@
-"""A field made into files of pictures: single ones, and turntables."""
+"""Export of fields as images and turntables."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.adaptation.base import Renderable
+from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.export.animation import choose_representation
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.encoding import encode_png
@@ -41,21 +43,21 @@ __all__ = [
 ]
 
 TURNTABLE_FORMATS = ("webp", "gif", "mp4", "webm")
-FRAMED, MARGIN = 48, 0.02  # voxels an axis of the hull that fits into an orbit, and the share of a side left free
+FRAMED, MARGIN = 48, 0.02  # voxels an axis of the hull that must fit into an orbit's pictures; free share of a side
 CODECS = {
     "mp4": {"codec": "libx264", "quality": 8},
-    # as good: 44.3 and 44.5 dB of the views of example-car; imageio-ffmpeg's quality says nothing to this encoder
+    # same quality (44.3 and 44.5 dB on the views of example-car); this encoder ignores imageio-ffmpeg's quality
     "webm": {"codec": "libvpx-vp9", "quality": None, "output_params": ["-crf", "10", "-b:v", "0"]},
 }
 
 
 FASTEST = 20
-"""Milliseconds that a frame of an animation lasts at least; browsers slow down what is faster."""
+"""Shortest duration of a frame of an animation, in milliseconds; browsers slow down faster ones."""
 
 
 @checked
 def to_pixels(images: Float[Tensor, "view 3 height width"]) -> npt.NDArray[np.uint8]:
-    """Images in [0, 1] as 8-bit pixels (view, height, width, 3); what lies outside is clamped.
+    """Images in [0, 1] as 8-bit pixels (view, height, width, 3); values outside are clamped.
 
     >>> to_pixels(torch.tensor([-1.0, 0.5, 2.0]).reshape(1, 3, 1, 1)).tolist()
     [[[[0, 128, 255]]]]
@@ -65,13 +67,13 @@ def to_pixels(images: Float[Tensor, "view 3 height width"]) -> npt.NDArray[np.ui
 
 @checked
 def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds: float = 4.0) -> bytes:
-    """An animation that repeats for ever, or a video, which needs imageio-ffmpeg: the extra `video`.
+    """An endless animation, or a video, which needs imageio-ffmpeg: the extra `video`.
 
     Args:
         frames: (frame, height, width, 3) pixels.
         kind: "webp" or "gif"; "mp4" or "webm" for a video.
-        seconds: of one round. No frame lasts less than 20 ms, which browsers would slow down, so that more than 50
-            frames a second take longer; a video has as many as it is asked for.
+        seconds: duration of one round. Frames of animations last at least 20 ms, since browsers slow down faster ones:
+            more than 50 frames a second take longer. Videos have any frame rate.
 
     Returns:
         The file.
@@ -91,12 +93,12 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
     if not 0 < seconds < math.inf:
         raise ValueError(f"seconds: expected a time above 0, got {seconds}")
     if kind in CODECS:
-        repeats = math.ceil(seconds / len(frames))  # players expect a frame a second or more
+        repeats = math.ceil(seconds / len(frames))  # players expect at least one frame a second
         return _video(frames.repeat(repeats, axis=0), kind, repeats * len(frames) / seconds)
     first, *others = [Image.fromarray(frame) for frame in frames]
     how = {"quality": 90, "method": 4} if kind == "webp" else {}
     buffer = io.BytesIO()
-    unit = 10 if kind == "gif" else 1  # milliseconds in which the format counts
+    unit = 10 if kind == "gif" else 1  # unit of durations in milliseconds
     ends = [unit * round(1000 * seconds * (index + 1) / len(frames) / unit) for index in range(len(frames))]
     duration = [max(FASTEST, end - begin) for begin, end in pairwise([0, *ends])]
     first.save(buffer, kind.upper(), save_all=True, append_images=others, duration=duration, loop=0, **how)
@@ -104,10 +106,10 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
 
 
 def require_encoder(kind: str) -> None:
-    """Refuse an animation that cannot be encoded here, before its frames are rendered.
+    """Check, before frames are rendered, that an animation can be encoded here.
 
     Args:
-        kind: one of `encode_animation`.
+        kind: as in `encode_animation`.
 
     Raises:
         MissingPackageError: a video without imageio-ffmpeg.
@@ -118,7 +120,7 @@ def require_encoder(kind: str) -> None:
 
 
 def _video(frames: npt.NDArray[np.uint8], kind: str, rate: float) -> bytes:
-    """A video of so many frames a second; a column or row is repeated where the number of them is odd."""
+    """A video of `rate` frames a second; odd sizes get one more row or column by repetition."""
     require_encoder(kind)
     from imageio_ffmpeg import write_frames
 
@@ -140,15 +142,16 @@ def _video(frames: npt.NDArray[np.uint8], kind: str, rate: float) -> bytes:
 def save_images(
     images: Float[Tensor, "view 3 height width"], folder: str | Path, names: Sequence[str] = ()
 ) -> list[Path]:
-    """Write one PNG an image.
+    """Write each image as PNG.
 
     Args:
         images: RGB in [0, 1].
-        folder: made where absent.
-        names: of the files, without ending; folders in them are dropped. Numbers where absent.
+        folder: created if absent.
+        names: file names, one an image; folders and the endings of image files are dropped. Numbers if absent or not
+            distinct.
 
     Returns:
-        The files. Names that are not one an image are a ValueError.
+        The files. Another number of names is a ValueError.
     """
     paths = picture_paths(len(images), Path(folder), names)
     for path, pixels in zip(paths, to_pixels(images), strict=True):
@@ -157,29 +160,30 @@ def save_images(
 
 
 def picture_paths(count: int, folder: Path, names: Sequence[str] = ()) -> list[Path]:
-    """Where so many pictures go: named as what they are pictures of, or numbered where these are not one each.
+    """Paths of pictures: with the given names, or numbered where these are absent or not distinct.
 
     Args:
-        count: of pictures.
-        folder: that holds them.
-        names: of files, whose ending and folders are dropped.
+        count: number of pictures.
+        folder: their folder.
+        names: file names; folders and the endings of image files are dropped.
 
     Returns:
         Paths of PNGs.
 
     Raises:
-        ValueError: names that are not one a picture.
+        ValueError: another number of names than of pictures.
     """
     if names and len(names) != count:
         raise ValueError(f"names: expected {count}, one an image, got {len(names)}")
-    stems = [Path(name).stem for name in names]
+    paths = [Path(name) for name in names]
+    stems = [path.stem if path.suffix.lower() in PICTURE_SUFFIXES else path.name for path in paths]
     if len(set(stems)) != count:
         stems = [f"{index:04d}" for index in range(count)]
     return [folder / f"{stem}.png" for stem in stems]
 
 
 def upward(cameras: PinholeCamera) -> tuple[float, float, float]:
-    """The direction in the world that is up in most pictures; +y where they do not agree on any.
+    """The world direction that is up in the pictures on average; +y where they do not agree.
 
     >>> upward(camera.pinhole(torch.eye(3), torch.eye(4)[None], 2, 2))
     (-0.0, -1.0, -0.0)
@@ -194,10 +198,10 @@ def upward(cameras: PinholeCamera) -> tuple[float, float, float]:
 def orbit_cameras(
     views: Views, count: int, *, size: int | None = None, elevation: float = math.radians(20.0)
 ) -> PinholeCamera:
-    """Cameras on a level circle around what the views show, as far away and with the lens of one of them.
+    """Cameras on a level circle around the object, at the distance of the views and with the lens of one of them.
 
-    Where the views have masks, the cameras stand further back if the visual hull would not fit into their pictures, as
-    after close-ups that the border cuts.
+    Where the views have masks and no lens distortion, the cameras stand further back if the visual hull would not fit
+    into their pictures, as after close-ups that crop the object.
 
     Args:
         views: posed images of the object.
@@ -206,11 +210,11 @@ def orbit_cameras(
         elevation: above the horizon of `upward`, in radians.
 
     Returns:
-        A batch of cameras; the first stands where the first view does, seen from above. Their lens is that of the view
-        with the squarest pixels: a portrait among landscapes was scaled to their size.
+        A batch of cameras, the first at the azimuth of the first view. Their lens is that of the view with the squarest
+        pixels, since a portrait picture among landscape ones was scaled to their size.
 
     Raises:
-        ValueError: no camera or pixel asked for, or no view to take after.
+        ValueError: a count or size below 1, or no views.
     """
     if not len(views):
         raise ValueError("views: expected at least one to take the lens and the distance of, got none")
@@ -219,7 +223,7 @@ def orbit_cameras(
     if size is not None and size < 1:
         raise ValueError(f"size: expected at least 1 pixel, got {size}")
     cameras, centre = views.cameras, torch.tensor(views.bounds.centre)
-    # the level circle: its first direction below the first view, and the one across
+    # the level circle: its direction towards the first view, and the one across
     positions = camera.centres(cameras).cpu().float() - centre
     up = torch.tensor(upward(cameras))
     front = positions[0] - (positions[0] @ up) * up
@@ -229,7 +233,7 @@ def orbit_cameras(
     side = torch.linalg.cross(up, front)
     angle = torch.arange(count) * (2 * math.pi / count)
     around = angle.cos()[:, None] * front + angle.sin()[:, None] * side
-    # cameras on it, as far away as most views
+    # cameras on it, at the median distance of the views
     distance = float(positions.norm(dim=1).median())
     eyes = centre + distance * (math.cos(elevation) * around + math.sin(elevation) * up)
     x, y, z = up.tolist()
@@ -247,8 +251,8 @@ def orbit_cameras(
 
 
 def _stepped_back(pose: Tensor, lens: PinholeCamera, views: Views) -> Tensor:
-    """Poses (camera from world) moved back along their axes, all alike, until the pictures show the visual hull."""
-    if views.masks is None:
+    """Poses (camera from world) moved back by one distance, so that the visual hull fits into the pictures."""
+    if views.masks is None or isinstance(views.cameras, DistortedCamera):
         return pose
     hull = carve(views.masks, views.cameras, views.bounds, FRAMED)
     points = hull.centres().to(pose)
@@ -259,7 +263,7 @@ def _stepped_back(pose: Tensor, lens: PinholeCamera, views: Views) -> Tensor:
     needed = seen.new_zeros(())
     for axis, side in ((0, width), (1, height)):
         focal, middle, margin = matrix[axis, axis], matrix[axis, 2], MARGIN * side
-        before, after = middle - margin, side - 1 - margin - middle  # pixels to the two borders
+        before, after = middle - margin, side - 1 - margin - middle  # pixels to both borders
         for place, room in ((-seen[..., axis], before), (seen[..., axis], after)):
             if room > 0:
                 needed = torch.maximum(needed, (place * focal / room - seen[..., 2]).max())
@@ -275,10 +279,10 @@ def save_turntable(
     """Render one round around the object and write it as an animation.
 
     Args:
-        field: what is seen; voxels of it draw a long round (`animation.choose_representation`).
-        views: its support views, whose lens, distance and up are taken.
+        field: what to render; a long round is rendered by voxels fitted to it (`animation.choose_representation`).
+        views: its support views, which give lens, distance and up.
         path: ends in .webp, .gif, .mp4 or .webm.
-        frames: of the round.
+        frames: number of frames.
         size: pixels along the longer side; that of the views where absent.
 
     Returns:

@@ -1,4 +1,4 @@
-"""A field shown in the browser while it changes, by viser: the extra `viz`."""
+"""Live view of a changing field in the browser, by viser: the extra `viz`."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ __all__ = ["LiveViewer", "beside", "require_viewer", "viewed_camera"]
 
 LOG = logging.getLogger(__name__)
 
-SECONDS = 0.15  # that a picture may take while the camera moves
-IDLE = 0.4  # seconds after which a camera that stands still gets a larger picture
+SECONDS = 0.15  # largest rendering time of a picture while the camera moves
+IDLE = 0.4  # seconds without motion after which a larger picture is rendered
 SHARPER = 2.5  # times as large
 SMALLEST, LARGEST = 48, 1024  # pixels of height
 WIDEST = 4096  # pixels of width
 THUMBNAIL = 128  # pixels of a photograph in its frustum
-ALONE = "nothing"  # what is shown beside the field unless somebody chooses
+ALONE = "nothing"  # the default choice for what is shown beside the field
 
 
 class Shown(Protocol):
-    """What renders new views."""
+    """Anything that renders new views."""
 
     def render(self, cameras: PinholeCamera) -> Pictures:
         """The pictures of the cameras."""
@@ -46,19 +46,19 @@ class Shown(Protocol):
 
 @dataclass
 class _Visit:
-    """When a visitor's camera moved or the field changed, when a picture was drawn, and whether no other is due."""
+    """Times of a visitor's last change (of camera or field) and last picture, and whether the last picture is final."""
 
     moved: float
     drawn: float = 0.0
     finished: bool = False
 
     def move(self) -> None:
-        """A picture is due."""
+        """Note that a picture is due."""
         self.moved, self.finished = time.monotonic(), False
 
     @property
     def due(self) -> float:
-        """When the next picture is: after a move at once, and a larger one when the camera stands still."""
+        """When the next picture is due: at once after a change, and a larger one once the camera stands still."""
         return math.inf if self.finished else self.moved + IDLE * (self.drawn >= self.moved)
 
 
@@ -72,10 +72,10 @@ def viewed_camera(
         position: in the world.
         fov: vertical field of view in radians.
         aspect: width over height.
-        height: pixels, fewer where the width would be more than WIDEST.
+        height: pixels; reduced where the width would exceed WIDEST.
 
     Raises:
-        ValueError: numbers that no camera has, as browsers send them of a page without a size.
+        ValueError: impossible values, as browsers send them for a page without a size.
     """
     if not _has_size(fov, aspect):
         raise ValueError(f"camera: expected an aspect above 0 and an angle below 180 degrees, got {aspect}, {fov}")
@@ -90,7 +90,7 @@ def viewed_camera(
 
 
 def _has_size(fov: float, aspect: float) -> bool:
-    """Whether these are of a page that can be seen."""
+    """Whether the page is visible, by its field of view and aspect."""
     return 0 < aspect < math.inf and 0 < fov < math.pi
 
 
@@ -103,7 +103,7 @@ def beside(left: Pictures, right: Pictures) -> Float[Tensor, "view 3 height widt
 
 
 def require_viewer() -> None:
-    """Refuse to show anything where viser is not installed.
+    """Check that viser is installed.
 
     Raises:
         MissingPackageError: it is not.
@@ -113,14 +113,14 @@ def require_viewer() -> None:
 
 
 class LiveViewer:
-    """A page on this machine that shows a field from where each visitor looks.
+    """A local web page that shows each visitor a field from their camera.
 
     Args:
         views: the support views, whose cameras are drawn as frusta with their photographs.
         port: of the page.
-        on_number: told how many of the views are wanted when somebody moves the slider; no slider where absent.
-        others: names of other methods, one of which somebody may choose to see beside the field; `show_other` gives
-            their fields.
+        on_number: called with the number of views when a visitor moves the slider; no slider if absent.
+        others: names of other methods, one of which visitors may show beside the field; `show_other` sets their
+            fields.
 
     Raises:
         MissingPackageError: viser is not installed.
@@ -138,7 +138,7 @@ class LiveViewer:
 
         self._shown: Shown | None = None
         self._others: dict[str, Shown | None] = {}
-        self._notes: dict[str, str] = {}  # of the others
+        self._notes: dict[str, str] = {}  # of the other methods
         self._chosen = ALONE
         self._changed, self._stopped = threading.Condition(), False
         self._visits: dict[int, _Visit] = {}
@@ -167,7 +167,7 @@ class LiveViewer:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """The address of the page."""
         return f"http://127.0.0.1:{self._server.get_port()}"
 
     def show(self, shown: Shown, note: str) -> None:
@@ -175,19 +175,19 @@ class LiveViewer:
 
         Args:
             shown: the field.
-            note: about it, beside the picture.
+            note: text about it, beside the picture.
         """
         with self._changed:
             self._shown, self._text = shown, note
             self._draw_anew()
 
     def show_other(self, name: str, shown: Shown | None, note: str = "") -> None:
-        """What another method makes of the same views.
+        """Set the field that another method makes of the same views.
 
         Args:
             name: one of `others`.
-            shown: its field; None where it has none, and the left half is the whole picture.
-            note: about it, below that about the field.
+            shown: its field; None if it has none, so that the field fills the picture.
+            note: text about it, below that about the field.
         """
         with self._changed:
             self._others[name], self._notes[name] = shown, note
@@ -199,11 +199,11 @@ class LiveViewer:
             self._draw_anew()
 
     def _notes_shown(self) -> str:
-        """What is noted about the field and the method beside it, as two paragraphs of Markdown."""
+        """The notes about the field and the method beside it, as two paragraphs of Markdown."""
         return "\n\n".join(filter(None, [self._text, self._notes.get(self._chosen)]))
 
     def _draw_anew(self) -> None:
-        """For every visitor; called with the lock."""
+        """Redraw for every visitor; the caller holds the lock."""
         self._note.content = self._notes_shown()
         for visit in self._visits.values():
             visit.move()
@@ -218,7 +218,7 @@ class LiveViewer:
         self._server.stop()
 
     def _add_frusta(self) -> Callable[[int], None]:
-        """Adds those of all views; returns what shows those of the first ones alone."""
+        """Add the frusta of all views; return a function that shows those of the first views alone."""
         cameras = self._views.cameras
         height, width = camera.image_size(cameras)
         every = max(1, max(height, width) // THUMBNAIL)
@@ -275,7 +275,7 @@ class LiveViewer:
             self._visits.pop(client.client_id, None)  # pyright: ignore
 
     def _draw(self) -> None:
-        """Draws for each visitor whose camera moved, and once more, larger, when it stands still."""
+        """Render for each visitor whose camera moved, and once more, larger, when it stands still."""
         while True:
             with self._changed:
                 if self._stopped:
@@ -285,11 +285,11 @@ class LiveViewer:
                 if self._shown is None or soonest > now:
                     self._changed.wait(None if self._shown is None or soonest == math.inf else soonest - now)
                     continue
-                # of those who wait the one whose last picture is oldest
+                # the waiting visitor whose last picture is oldest
                 waiting = [(visit.drawn, visitor) for visitor, visit in self._visits.items() if visit.due <= now]
                 _, visitor = min(waiting)
                 client = self._server.get_clients().get(visitor)
-                if client is None:  # gone before it was welcomed
+                if client is None:  # left before being set up
                     del self._visits[visitor]
                     continue
                 shown, other, visit = self._shown, self._others.get(self._chosen), self._visits[visitor]
@@ -297,7 +297,7 @@ class LiveViewer:
                 visit.drawn, visit.finished = now, still
             try:
                 drawn, failure = self._draw_for(client, shown, other, still), ""
-            except Exception as error:  # of one visitor and one picture: the page goes on
+            except Exception as error:  # concerns one picture of one visitor; the page goes on
                 LOG.exception("a picture of the page could not be drawn")
                 drawn, failure = False, f"a picture could not be drawn: {error}"
             with self._changed:
@@ -307,13 +307,13 @@ class LiveViewer:
                 visit.finished = visit.finished or (not drawn and visit.moved == moved)
 
     def _draw_for(self, client: object, shown: Shown, other: Shown | None, still: bool) -> bool:
-        """One picture for one visitor; False where the visitor's page has no size.
+        """Render one picture for one visitor; False if the visitor's page has no size.
 
         Args:
-            client: viser's handle of the visitor.
-            shown: what is drawn.
-            other: what is drawn on the right half.
-            still: the camera does not move, so that the picture may take longer.
+            client: viser's handle for the visitor.
+            shown: what to render.
+            other: what to render on the right half, if anything.
+            still: whether the camera stands still, so that rendering may take longer.
         """
         height = min(LARGEST, round(self._height * (SHARPER if still else 1)))
         eye = client.camera  # pyright: ignore
@@ -326,7 +326,7 @@ class LiveViewer:
         if not still:
             ratio = (SECONDS / max(1e-3, time.perf_counter() - started)) ** 0.5
             self._height = round(min(LARGEST / SHARPER, max(SMALLEST, self._height * min(1.5, max(0.5, ratio)))))
-        # without loss where it stands still: blocks of JPEG would be taken for the field's
+        # lossless when it stands still: JPEG artefacts would be mistaken for the field's
         client.scene.set_background_image(picture, "png" if still else "jpeg", jpeg_quality=90)  # pyright: ignore
         return True
 

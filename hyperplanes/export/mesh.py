@@ -1,4 +1,4 @@
-"""The surface of a field as a triangle mesh with coloured vertices: cut from a grid of density, and written."""
+"""Triangle meshes with vertex colours from the density of a field."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ __all__ = [
 MESH_FORMATS = ("ply", "glb", "obj")
 
 
-BYTES_OF_POINT = 64  # of a grid, while its density is computed
+BYTES_OF_POINT = 64  # of the grid, while its density is computed
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Surface:
     Attributes:
         vertices: (vertex, 3).
         faces: (face, 3) vertex indices.
-        colours: (vertex, 3) sRGB in [0, 1], each as seen from straight above its place.
+        colours: (vertex, 3) sRGB in [0, 1], as seen along the normal.
     """
 
     vertices: npt.NDArray[np.float32]
@@ -55,7 +55,7 @@ class Surface:
 
 
 def check_voxels(voxels: int) -> None:
-    """Refuse a grid that is none, or too large for `density_grid`.
+    """Check the size of a grid for `density_grid`.
 
     Args:
         voxels: points along each side.
@@ -73,11 +73,11 @@ def density_grid(field: AdaptedField, voxels: int = 128) -> Float[Tensor, "x y z
     """The density of a field at the corners of a grid, zero where its occupancy is empty and outside its sphere.
 
     Args:
-        field: asked only where its occupancy may hold something.
+        field: evaluated only where its occupancy is not empty.
         voxels: points along each side of the cube around the scene; the outer ones lie on its faces.
 
     Returns:
-        Density per world unit. `check_voxels` says how many voxels they may be.
+        Density per world unit. `check_voxels` checks the number of voxels.
     """
     check_voxels(voxels)
     occupancy = field.occupancy
@@ -85,7 +85,7 @@ def density_grid(field: AdaptedField, voxels: int = 128) -> Float[Tensor, "x y z
     axis = torch.linspace(-1, 1, voxels, device=device)
     grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     points = grid * bounds.radius + torch.tensor(bounds.centre, device=device)
-    inside = grid.norm(dim=1) <= 1  # no ray samples beyond the sphere
+    inside = grid.norm(dim=1) <= 1  # rays have no samples beyond the sphere
     live = (occupancy.dilated().contains(points) & inside).nonzero()[:, 0]
     density = torch.zeros(len(points), device=device)
     for part in live.split(1 << 16):
@@ -102,17 +102,17 @@ def extract_mesh(
     level: float | None = None,
     density: Float[Tensor, "x y z"] | None = None,
 ) -> Surface:
-    """The surface on which the density crosses a level, by marching cubes.
+    """The isosurface of the density at a level, by marching cubes.
 
     Args:
-        field: asked on a grid, only where its occupancy may hold something.
+        field: evaluated on a grid, only where its occupancy is not empty.
         voxels: along each side of the cube around the scene.
-        level: density per world unit; where absent, what makes 1/64 of the scene's diameter half opaque. `choose_level`
-            finds the one whose silhouettes and depth agree with the rendered ones.
-        density: of `density_grid`, where it was computed before; `voxels` does not count then.
+        level: density per world unit; if absent, the one that makes 1/64 of the scene's diameter half opaque.
+            `choose_level` finds the level whose silhouettes and depth agree best with the rendered ones.
+        density: of `density_grid`, if it was computed before; `voxels` is then ignored.
 
     Returns:
-        The surface, closed at the border of the cube too.
+        The surface, closed also at the border of the cube.
 
     Raises:
         ValueError: a level that is not positive or that the density never reaches; fewer than 8 voxels.
@@ -137,7 +137,7 @@ def extract_mesh(
 
 
 def as_trimesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) -> trimesh.Trimesh:
-    """A mesh for trimesh, its vertices left as they are."""
+    """A trimesh mesh with unchanged vertices."""
     import trimesh
 
     return trimesh.Trimesh(vertices, faces, process=False)
@@ -154,10 +154,10 @@ def _colours(field: AdaptedField, mesh: trimesh.Trimesh, device: torch.device) -
 def save_mesh(surface: Surface, path: str | Path) -> Path:
     """Write a surface as PLY, GLB or OBJ, vertex colours included.
 
-    glTF wants linear colours, the other two take them as they are on the screen.
+    glTF stores linear colours, the other two sRGB.
 
     Args:
-        surface: what to write.
+        surface: the surface to write.
         path: ends in .ply, .glb or .obj.
 
     Returns:

@@ -1,8 +1,7 @@
-"""What the cameras cannot see into, made dense, so that a surface closes around it.
+"""Filling of regions that no camera sees into, so that the surface closes around them.
 
-Two things make a part of a field opaque: high density, and low density through a long way. A level of density finds the
-first, `fill_hidden` the second. Walls of fog, which a field of one forward pass has, were holes without
-it.
+A part of a field is opaque by high density, or by low density over a long distance. A level of density finds the
+first, `fill_hidden` the second. Without it, foggy walls, as in fields of one forward pass, would be holes.
 """
 
 from __future__ import annotations
@@ -21,27 +20,27 @@ from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 __all__ = ["fill_hidden"]
 
 HIDDEN = 0.35
-"""Opacity in front of a point from which on a camera does not see it. The camera with the clearest look decides, so 0.5
-leaves dents in walls of fog. Of two cars after one forward pass, seen from seven places, 94.0 % of the pixels were as
-far away as rendered, 94 % with 0.5, 90 % with 0.2, and 93 % by a level alone, which left holes; a chair that was
-fine-tuned for 60 steps stayed as it was (94.6 %)."""
+"""Opacity in front of a point from which on a camera does not see it. The camera with the clearest view decides, so 0.5
+leaves dents in foggy walls. Of two cars after one forward pass, seen from seven places, 94.0 % of the pixels had the
+rendered depth, 94 % with 0.5, 90 % with 0.2, and 93 % by a level alone, which left holes; a chair that was fine-tuned
+for 60 steps did not change (94.6 %)."""
 
 
 @torch.no_grad()
 def fill_hidden(
     density: Float[Tensor, "x y z"], level: float, bounds: Sphere, cameras: PinholeCamera
 ) -> Float[Tensor, "x y z"]:
-    """The density, with what no camera sees into made as dense as the level and more.
+    """The density, raised to the level and above where no camera sees.
 
     Args:
         density: of `density_grid`.
-        level: at which the surface will be cut.
-        bounds: the sphere that the grid's cube is around.
-        cameras: all of them look; what is in none of their images stays as it is.
+        level: of the surface to extract.
+        bounds: the sphere inside the grid's cube.
+        cameras: all are used; places outside all images do not change.
 
     Returns:
-        A grid that is above the level where the density is, or where each camera that has the place in its image has
-        an opacity above HIDDEN before it.
+        A grid that exceeds the level where the density does, or where the opacity in front of the place exceeds HIDDEN
+        for every camera that has it in its image.
     """
     side = len(density)
     live = density.nonzero()
@@ -67,7 +66,7 @@ def _opacity_before(
 ) -> Float[Tensor, " point"]:
     """The opacity between one camera and each point, infinite where the point is not in its image.
 
-    It is integrated along rays through a grid of pixels, half as fine as the density's, and interpolated between them.
+    Integrated along rays through a grid of pixels, half as fine as that of the density, and interpolated between them.
     """
     height, width = camera.image_size(cameras)
     offsets = points - camera.centres(cameras)
@@ -84,7 +83,7 @@ def _opacity_before(
     along = torch.linspace(near, far, math.ceil((far - near) / voxel) + 2, device=points.device)
     rays = cast(cameras, torch.zeros(len(through), dtype=torch.long, device=points.device), through)
     values = []
-    for part in range(0, len(rays), side):  # a row of pixels at a time
+    for part in range(0, len(rays), side):  # one row of pixels at a time
         places = bounds.normalise(rays[part : part + side].at(along.expand(side, -1)))
         values.append(grid_sample(density[None, None], places.flip(-1)[None, None], align_corners=True)[0, 0, 0])
     values = torch.cat(values)

@@ -1,4 +1,4 @@
-"""How well surfaces of a field agree with its pictures, and the level of density whose surface agrees best."""
+"""Agreement of a field's surfaces with its pictures, and the density level whose surface agrees best."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 
 __all__ = ["Agreement", "agreement", "choose_level"]
 
-SILHOUETTE = 64  # pixels along the longer side of the silhouettes that surfaces are compared by
+SILHOUETTE = 64  # pixels along the longer side of the compared silhouettes
 LEVEL_VIEWS = 8
 LEVELS = 60
 DEPTH_TOLERANCE = 0.05  # radii of the scene
@@ -28,11 +28,11 @@ DEPTH_TOLERANCE = 0.05  # radii of the scene
 
 @torch.no_grad()
 def choose_level(field: AdaptedField, density: Float[Tensor, "x y z"], cameras: PinholeCamera) -> float:
-    """The density at which the surface has most nearly the silhouettes and the depth that the field is rendered with.
+    """The density level whose surface agrees best with the rendered silhouettes and depth of the field.
 
     A ray meets the surface of a level where the density along it first exceeds the level, so one pass over the rays
-    judges every level. A fixed level leaves holes where walls are opaque by being thick, not dense; silhouettes alone
-    do not see a hole with a wall behind it.
+    tests every level. A fixed level leaves holes in walls that are opaque by thickness, not density; silhouettes alone
+    miss holes with a wall behind them.
 
     Args:
         field: rendered by its own sampler.
@@ -63,13 +63,12 @@ def choose_level(field: AdaptedField, density: Float[Tensor, "x y z"], cameras: 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well a surface shows what the field's pictures show.
+    """How well a surface agrees with the field's pictures.
 
     Attributes:
-        overlap: of the silhouettes: intersection over union, mean over views.
-        depth: share of the pixels that both cover at which the surface is as far away as the field is rendered, to
-            `DEPTH_TOLERANCE` of the scene's radius. A hole through which the far side is seen lowers it; 0 where no
-            pixel is covered by both.
+        overlap: intersection over union of the silhouettes, mean over views.
+        depth: share of the pixels covered by both at which the surface has the rendered depth, to `DEPTH_TOLERANCE` of
+            the scene's radius. Holes that show the far side lower it; 0 where no pixel is covered by both.
     """
 
     overlap: float
@@ -81,7 +80,7 @@ def agreement(surface: Surface, field: AdaptedField, cameras: PinholeCamera) -> 
     """Compare a surface with the pictures of the field that it was cut from.
 
     Args:
-        surface: rays are cast at its triangles.
+        surface: its triangles are ray-cast.
         field: rendered by its own sampler; a pixel counts where it is more than half opaque.
         cameras: all of them, at 64 pixels.
 
@@ -122,7 +121,7 @@ def _pixel_rays(cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
 
 
 def _rendered(field: AdaptedField, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """What a field's pictures cover, and how far away it is along the rays; both (view, pixel), on the CPU."""
+    """Coverage and distance along the rays in a field's pictures; both (view, pixel), on the CPU."""
     pictures = field.render(cameras, antialias=False, mixed_precision=False)
     return pictures.opacity.flatten(1).cpu() > 0.5, pictures.depth.flatten(1).cpu()
 
@@ -132,7 +131,7 @@ def _first_crossings(
 ) -> Iterator[Float[Tensor, "pixel level"]]:
     """Where the density along the ray of each pixel first exceeds each level.
 
-    The density is trilinear between the grid's points and looked at every half voxel.
+    The density is interpolated trilinearly and sampled every half voxel.
 
     Yields:
         For each view, distances along the rays, infinite where the level is never exceeded.

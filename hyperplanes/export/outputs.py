@@ -1,4 +1,4 @@
-"""Pictures of what a renderer puts out beside colour, under nerfstudio's names: depth, normals, accumulation."""
+"""Images of renderer outputs, under nerfstudio's names: rgb, depth, normals, accumulation."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from hyperplanes.utilities.writing import write_json, write_whole
 __all__ = ["OUTPUTS", "depth_pixels", "output_frames", "save_outputs"]
 
 OUTPUTS = ("rgb", "depth", "normals", "accumulation")
-"""What can be drawn."""
+"""The outputs."""
 
 NEAREST, FARTHEST = 2**14, 2**16 - 1
-"""Pixels of depth; the nearest is a quarter of white, so that it is told from 0, where there is nothing."""
+"""Pixel values of depth; the nearest is a quarter of white, distinct from 0 for empty pixels."""
 
 
 def depth_pixels(z: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint16], float, float]:
@@ -53,7 +53,7 @@ def output_frames(name: str, pictures: Pictures, cameras: PinholeCamera) -> npt.
     Args:
         name: one of OUTPUTS.
         pictures: of a field.
-        cameras: which took them.
+        cameras: their cameras.
     """
     pixels, _ = _pixels(name, pictures, cameras)
     if pixels.dtype == np.uint16:
@@ -65,21 +65,21 @@ def output_frames(name: str, pictures: Pictures, cameras: PinholeCamera) -> npt.
 def save_outputs(
     outputs: Sequence[str], pictures: Pictures, cameras: PinholeCamera, folder: str | Path, names: Sequence[str] = ()
 ) -> list[Path]:
-    """Write one PNG a view and output: of rgb into the folder, of the others into one of their name in it.
+    """Write a PNG for each view and output: rgb into the folder, others into subfolders of their names.
 
     Depth is the coordinate along the optical axis in 16 bits, as `depth_pixels` says, with the nearest and the farthest
-    in depth.json beside; normals are (n + 1) / 2 of unit vectors in the world, white where there is no surface;
+    in depth.json; normals are (n + 1) / 2 of unit vectors in the world, white where there is no surface;
     accumulation is opacity.
 
     Args:
         outputs: some of OUTPUTS.
         pictures: of a field.
-        cameras: which took them.
-        folder: made where absent.
+        cameras: their cameras.
+        folder: created if absent.
         names: as in `save_images`.
 
     Returns:
-        The pictures. Names that are not one a view are a ValueError.
+        The pictures. Another number of names than of views is a ValueError.
     """
     written = []
     for output in outputs:
@@ -94,10 +94,10 @@ def save_outputs(
 
 
 def _pixels(name: str, pictures: Pictures, cameras: PinholeCamera) -> tuple[npt.NDArray, dict[str, float]]:
-    """The pixels of an output, and what has to be known to read them.
+    """The pixels of an output, and the numbers needed to read them.
 
     Raises:
-        ValueError: an output that is none.
+        ValueError: an unknown output.
     """
     if name not in OUTPUTS:
         raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, got {name!r}")

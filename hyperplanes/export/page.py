@@ -1,4 +1,4 @@
-"""Baked voxels as HTML: one file, or a part of a page, on which the object is turned with the mouse or a finger."""
+"""Baked voxels as an HTML file, or part of a page: a viewer to turn the object by mouse or touch."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from hyperplanes.views import Views
 __all__ = ["AROUND", "LARGEST", "address_of", "page_of", "save_page", "turning_picture"]
 
 LARGEST = 8_000_000
-"""Bytes of a page. Beyond it coefficients get fewer bits, the second-order ones first."""
+"""Most bytes of a page. Beyond it, coefficients get fewer bits, those of second order first."""
 
 AROUND = 4096
-"""Of these, bytes for what `save_page` puts around: some 500, and twice the title of at most 255, escaped at worst."""
+"""Of these, bytes for the frame of `save_page`: some 500, and twice the escaped title of at most 255."""
 
 BITS = ((8, 8, 8), (8, 7, 6), (8, 6, 5), (8, 6, 4), (7, 5, 3), (7, 5, 0))
-"""Of the mean colour, the first and the second order; 0 leaves an order out. Tried in turn until the page is small."""
+"""Bits of the mean colour, the first and the second order; 0 omits an order. Tried in turn until the page fits."""
 
-STEPS = 192  # of rays, along a diameter of the scene's sphere, as of `BakedScene`
-OWN = 8.0  # how much a voxel's own colour counts, and each neighbour's 1, when colours are prepared for the page
-CLAMP = 1e-3  # of the values of a coefficient that may lie beyond its range, at either end
+STEPS = 192  # samples along a diameter of the scene's sphere, as in `BakedScene`
+OWN = 8.0  # weight of a voxel's own colour, beside 1 of each neighbour, when colours are prepared for the page
+CLAMP = 1e-3  # share of a coefficient's values clamped at either end of its range
 STYLE = """<style>
 .voxels { position: relative; aspect-ratio: 1; width: 100%; overflow: hidden; background: #fff; }
 .voxels canvas, .voxels img { position: absolute; inset: 0; width: 100%; height: 100%; object-fit: contain; }
@@ -62,22 +62,22 @@ body > p {{ position: fixed; left: 1em; bottom: 0; pointer-events: none; }}
 
 
 def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: int = LARGEST - AROUND) -> str:
-    """A part of an HTML page that draws baked voxels by WebGL2; any number of them may stand in one page.
+    """An HTML fragment that renders baked voxels by WebGL2; a page may hold any number of them.
 
     Args:
-        baked: what is shown.
-        views: whose up, distance and lens the viewer begins with.
-        picture: a WebP file, animated or not, that stands there until the voxels are shown, and where they cannot be.
-        largest: bytes of all that is returned, in UTF-8.
+        baked: the voxels to show.
+        views: give up, distance and lens of the initial camera.
+        picture: a WebP file, animated or not, shown until the voxels are, or if they cannot be.
+        largest: most bytes of the result, in UTF-8.
 
     Returns:
-        A `<div class="voxels">` with all that it needs, as wide as what it stands in and square unless styled
-        otherwise. `address_of` gives the fragment of an address that asks for one camera.
+        A self-contained `<div class="voxels">`, as wide as its parent and square unless styled otherwise. `address_of`
+        gives the URL fragment for a camera.
 
     Raises:
-        ValueError: voxels that do not get small enough.
+        ValueError: voxels that do not fit.
     """
-    # what the viewer begins with
+    # the initial camera
     start = orbit_cameras(views, 1)
     scene = {
         "side": baked.side,
@@ -92,7 +92,7 @@ def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: i
     still = f'<img alt="" src="data:image/webp;base64,{base64.b64encode(picture).decode()}">' if picture else ""
     viewer = resources.files("hyperplanes.export").joinpath("viewer.js").read_text("utf-8")
     size = 0
-    # as many bits a number as the size allows
+    # as many bits per number as the size allows
     for bits in BITS:
         low, span, text = _encoded(baked, bits)
         described = json.dumps({**scene, "low": low, "range": span})
@@ -111,7 +111,7 @@ def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: i
 
 
 def save_page(fragment: str, path: str | Path, title: str) -> Path:
-    """Write a part of a page as one HTML file that needs nothing else.
+    """Write a fragment as a self-contained HTML file.
 
     Args:
         fragment: of `page_of`.
@@ -127,7 +127,7 @@ def save_page(fragment: str, path: str | Path, title: str) -> Path:
 
 
 def address_of(cameras: PinholeCamera) -> str:
-    """The fragment of an address by which a page shows what one camera sees, at its size in the upper left corner.
+    """The URL fragment by which a page shows one camera's view, at its size in the upper left corner.
 
     Args:
         cameras: a batch of one.
@@ -150,9 +150,9 @@ def turning_picture(baked: BakedField, views: Views, *, frames: int = 24, size: 
     """A turntable as an animated WebP, for `page_of` to fall back to.
 
     Args:
-        baked: what is seen.
-        views: whose lens, distance and up are taken.
-        frames: of one round.
+        baked: the voxels to render.
+        views: give lens, distance and up.
+        frames: number of frames.
         size: pixels along the longer side.
     """
     from hyperplanes.export.baking import BakedScene
@@ -164,8 +164,8 @@ def turning_picture(baked: BakedField, views: Views, *, frames: int = 24, size: 
 def _encoded(baked: BakedField, bits: tuple[int, int, int]) -> tuple[list[float], list[float], str]:
     """Lowest value and range of every coefficient, and the voxels in base 64.
 
-    They are a bit a voxel, the upper and lower bytes of the optical depth of a voxel in half precision, and a byte a
-    coefficient, one coefficient after the other, compressed by deflate.
+    The voxels are an occupancy bit each, the upper and lower bytes of the optical depths in half precision, and a byte
+    per coefficient, one coefficient after the other, compressed by deflate.
     """
     filled = baked.index.flatten() >= 0
     order = baked.index.flatten()[filled].long()
@@ -191,7 +191,7 @@ def _quantile(values: Float[Tensor, "row number"], share: float) -> Float[Tensor
 
 
 def _smoothed(baked: BakedField) -> Float[Tensor, "row 27"]:
-    """Colours for interpolation without regard to density: where a voxel has little, those of denser neighbours."""
+    """Colours to be interpolated without density weights: voxels of low density take those of denser neighbours."""
     padded = torch.nn.functional.pad(baked.index, (1,) * 6, value=-1)
     place = (baked.index >= 0).nonzero() + 1
     row = baked.index[baked.index >= 0].long()
@@ -208,4 +208,4 @@ def _smoothed(baked: BakedField) -> Float[Tensor, "row 27"]:
     return torch.where(total[:, -1:] > 0, total[:, :-1] / total[:, -1:].clamp_min(1e-20), baked.values[:, 1:])
 
 
-assert HARMONICS == 9  # the viewer's shader has as many
+assert HARMONICS == 9  # as in the viewer's shader

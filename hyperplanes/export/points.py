@@ -1,4 +1,4 @@
-"""A cloud of points on the surface of a field: where its pictures put it, with colours and normals, as PLY."""
+"""Point clouds on the surface of a field, from its rendered depth, with colours and normals, as PLY."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from hyperplanes.utilities.writing import write_whole
 __all__ = ["POINTS", "PointCloud", "point_cloud", "save_points"]
 
 POINTS = 100_000
-OPAQUE = 0.9  # opacity from which on a pixel is a point
-TOLERANCE = 0.02  # radii of the scene by which depths of one place may differ between views
-HALVINGS = 24  # of the side of the cells in which points are averaged
-FINEST = 1e-4  # of the scene's radius: the smallest cell
+OPAQUE = 0.9  # opacity from which on a pixel gives a point
+TOLERANCE = 0.02  # largest difference of depths of one place between views, in radii of the scene
+HALVINGS = 24  # bisection steps for the side of the cells in which points are averaged
+FINEST = 1e-4  # smallest cell, in radii of the scene
 
 
 @dataclass(frozen=True)
@@ -49,19 +49,19 @@ class PointCloud:
 @checked
 @torch.no_grad()
 def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, count: int = POINTS) -> PointCloud:
-    """The points of all opaque pixels, those of one place averaged, and those that other views contradict left out.
+    """The points of all opaque pixels, averaged in cells, without those that other views contradict.
 
-    A view contradicts a point that lies in front of what it shows there: it looks through it. A point stays where more
-    views show a surface there than look through it.
+    A view contradicts a point that lies in front of the surface it shows there. A point is kept if more views show a
+    surface there than contradict it.
 
     Args:
         pictures: of a field, from all around.
-        cameras: which took them.
+        cameras: their cameras.
         bounds: of the scene.
-        count: of points, at most; of all where there are fewer.
+        count: most points.
 
     Returns:
-        At most so many, on the CPU.
+        At most `count` points, on the CPU.
 
     Raises:
         ValueError: pictures of nothing, or a count below 1 or so low that no mean is on the surface.
@@ -84,7 +84,7 @@ def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, coun
 
 
 def _averaged(values: Tensor, points: Tensor, bounds: Sphere, count: int) -> Tensor:
-    """The means of the rows in the cells of the finest grid of which at most so many are filled."""
+    """Means of the rows in the cells of the finest grid with at most `count` filled cells."""
     low, high = FINEST, 4.0
     for _ in range(HALVINGS):
         side = (low * high) ** 0.5
@@ -96,7 +96,7 @@ def _averaged(values: Tensor, points: Tensor, bounds: Sphere, count: int) -> Ten
 
 
 def _cells(points: Tensor, bounds: Sphere, side: float) -> Int[Tensor, " point"]:
-    """The number of the cell that each point is in, of a grid of cells so many radii wide."""
+    """The index of each point's cell in a grid whose cells are `side` radii wide."""
     place = (bounds.normalise(points.double()) / side).floor().long()
     place = place - place.amin(0)
     span = place.amax(0) + 1
@@ -104,7 +104,7 @@ def _cells(points: Tensor, bounds: Sphere, side: float) -> Int[Tensor, " point"]
 
 
 def _is_confirmed(points: Tensor, z: Tensor, cameras: PinholeCamera, bounds: Sphere) -> Tensor:
-    """Whether more views show a surface at a point than look through it."""
+    """Whether more views show a surface at a point than see past it."""
     height, width = z.shape[1:]
     votes = torch.zeros(len(points), dtype=torch.long)
     for view in range(len(z)):
@@ -125,7 +125,7 @@ def save_points(cloud: PointCloud, path: str | Path) -> Path:
     """Write a cloud as binary PLY: x y z, nx ny nz, red green blue.
 
     Args:
-        cloud: what to write.
+        cloud: the points to write.
         path: ends in .ply.
 
     Returns:

@@ -1,7 +1,7 @@
-"""Gaussian splats of baked voxels: one a voxel, fitted to posed images, in the files that viewers read.
+"""Gaussian splats from baked voxels, one a voxel, fitted to posed images and written for common viewers.
 
-Axes: viewers of splats show files as the original code wrote them, whose world has y down, as COLMAP's often has. Files
-are therefore turned half about x: what has y up here stands upright there.
+Axes: splat viewers expect y down, like the original code and often COLMAP. Files are therefore rotated by a half turn
+about x, so that an object with y up here stands upright there.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ from hyperplanes.views import Views
 __all__ = ["SPLAT_FORMATS", "Splats", "fit_splats", "save_splats", "splats_of"]
 
 SPLAT_FORMATS = ("ply", "splat")
-SIZE = 0.45  # standard deviation of a splat before it is fitted, in voxels
+SIZE = 0.45  # standard deviation of a splat before fitting, in voxels
 STEPS = 160
 RATES = {"means": 0.3, "scales": 0.06, "quaternions": 0.06, "logits": 0.4, "coefficients": 0.02}
-"""Of each step, at first: means in sizes of splats, scales by their logarithms."""
+"""Initial learning rates: of means in units of the splats' size, of scales as logarithms."""
 
-DIRECTIONAL = 0.2  # the rate of what depends on direction, of that of the mean colour
-SEEN = 0.1  # pixels of any picture that a splat makes up; below, it is hidden by others and left out
-AROUND = 16  # cameras from all sides, beside the shown views, that say which splats are hidden
+DIRECTIONAL = 0.2  # learning rate of view-dependent coefficients, relative to that of the mean colour
+SEEN = 0.1  # largest contribution to a picture, in pixels, below which a splat counts as hidden and is left out
+AROUND = 16  # cameras from all sides, beside the views, that decide which splats are hidden
 MEAN = 0.28209479  # the first harmonic
-HALF_TURN = (1, -1, -1, 1, -1, 1, 1, -1, 1)  # of the harmonics under (x, y, z) -> (x, -y, -z)
+HALF_TURN = (1, -1, -1, 1, -1, 1, 1, -1, 1)  # signs of the harmonics under (x, y, z) -> (x, -y, -z)
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians.
+    """Gaussian splats.
 
     Attributes:
         means: in the world.
         scales: standard deviations along the axes of each, in world units.
         quaternions: rotations of these axes, real part first, of any length.
-        logits: of the opacities at the centres.
-        coefficients: of colour, red first, as those of a `BakedField`.
+        logits: logits of the opacities at the centres.
+        coefficients: colour coefficients, red first, as in `BakedField`.
     """
 
     means: Float[Tensor, "splat 3"]
@@ -63,25 +63,25 @@ class Splats:
         return Splats(*(getattr(self, part.name)[chosen] for part in fields(self)))
 
     def colours(self, cameras: PinholeCamera) -> Float[Tensor, "splat 3"]:
-        """As one camera sees them, 0 or more; a batch of one."""
+        """The colours seen by one camera (a batch of one), at least 0."""
         directions = torch.nn.functional.normalize(self.means - camera.centres(cameras), dim=-1)
         basis = spherical_harmonics(directions)[:, None]
         return (self.coefficients.reshape(-1, 3, HARMONICS) * basis).sum(-1).clamp_min(0)
 
     def picture(self, cameras: PinholeCamera) -> Float[Tensor, "3 height width"]:
-        """What one camera sees over white, with gradients; a batch of one."""
+        """The picture of one camera (a batch of one) over white, differentiable."""
         shape = self.means, self.scales, self.quaternions, self.logits.sigmoid()
         return render_splats(*shape, self.colours(cameras), cameras)
 
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Float[Tensor, "view 3 height width"]:
-        """Their pictures over white."""
+        """The pictures of all cameras over white."""
         return torch.stack([self.picture(camera.select(cameras, [view])) for view in range(cameras.batch_size)])
 
 
 @checked
 def splats_of(baked: BakedField) -> Splats:
-    """One round splat a voxel, as opaque as the voxel is and with its colours."""
+    """One round splat a voxel, with its opacity and colours."""
     places = (baked.index >= 0).nonzero()
     rows = baked.values[baked.index[baked.index >= 0].long()]
     voxel = 2 * baked.bounds.radius / baked.side
@@ -102,24 +102,24 @@ def fit_splats(
     seed: int = 0,
     on_step: Callable[[int], None] | None = None,
 ) -> Splats:
-    """The splats that can be seen, after gradient steps (Adam) on all that describes them, one view a step.
+    """The visible splats after gradient steps (Adam) on all their parameters, one view a step.
 
-    Of cars of 100 x 100 pixels with 25 views shown, round splats whose opacities and colours alone were fitted had 8 dB
-    less on other views than their voxels. Three quarters of them were hidden.
+    On cars of 100 x 100 pixels with 25 support views, round splats with only opacities and colours fitted had 8 dB less
+    on other views than their voxels. Three quarters of them were hidden.
 
-    Fitted to a few views alone, they show these and little else, as voxels do. With the guide example-car at 64 x 64
-    pixels has 25.8 dB on other views instead of 22.5 with three views shown, and 27.0 instead of 24.7 with six.
+    Fitted to a few views alone, splats overfit, as voxels do. With the guide, example-car at 64 x 64 pixels has 25.8 dB
+    on other views instead of 22.5 with three support views, and 27.0 instead of 24.7 with six.
 
     Args:
-        splats: where it starts.
+        splats: the initial splats.
         views: posed images of the object, without lens distortion.
-        guide: renderings of the voxels from other places, from `render_guide`, which are views like the others.
+        guide: renderings of the voxels from other places, `render_guide(..., size=views.size)`; views like the others.
         steps: gradient steps.
-        seed: of the order of the views.
-        on_step: told the number of steps done.
+        seed: for the order of the views.
+        on_step: called with the number of steps done.
 
     Returns:
-        At most as many splats; as they are where there is no step.
+        At most as many splats; the given ones if there are no steps.
 
     Raises:
         ValueError: no views, cameras with lens distortion, or a guide of another size.
@@ -128,14 +128,17 @@ def fit_splats(
         found = "some with it" if len(views) else "none"
         raise ValueError(f"views: expected at least one without lens distortion, got {found}")
     if guide is not None and guide.size != views.size:
-        raise ValueError(f"guide: expected renderings of the views' size {views.size}, got {guide.size}")
+        raise ValueError(
+            f"guide: expected renderings of the views' size {views.size}, got {guide.size}; "
+            "make them by render_guide(..., size=views.size)"
+        )
     if not steps:
         return splats
     views = views.to("cpu", torch.float32)
     views = views if guide is None else _joined(views, guide)
     splats = splats[_weights(splats, views) > SEEN]
     size = float(splats.scales.mean()) if len(splats.scales) else 1.0
-    # offsets of all numbers from what they begin with, each kind with its rate
+    # offsets of all parameters from their initial values, each kind with its learning rate
     free = {name: torch.zeros_like(getattr(splats, name)).requires_grad_() for name in RATES}
     descent = Adam([{"params": [free[name]], "lr": RATES[name]} for name in RATES], betas=(0.9, 0.99))
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, 0.1 ** (1 / max(1, steps)))
@@ -152,7 +155,7 @@ def fit_splats(
         )
 
     generator = torch.Generator().manual_seed(seed)
-    # every view as often as every other, in random order
+    # every view equally often, in random order
     order = torch.cat([torch.randperm(len(views), generator=generator) for _ in range(-(-steps // len(views)))])
     for step, view in enumerate(order[:steps].tolist()):
         picture = moved().picture(camera.select(views.cameras, [view]))
@@ -167,16 +170,16 @@ def fit_splats(
 
 
 def _joined(views: Views, guide: Views) -> Views:
-    """All of them, with the bounds of the first."""
+    """All views, with the bounds of the first."""
     guide = guide.to("cpu", torch.float32)
     cameras = camera.concatenate([views.cameras, guide.cameras])
     return Views(torch.cat([views.images, guide.images]), cameras, bounds=views.bounds)
 
 
 def _weights(splats: Splats, views: Views) -> Float[Tensor, " splat"]:
-    """The largest sum over a picture of the compositing weights of each splat, of the views and of cameras around.
+    """Each splat's compositing weights summed over a picture: the largest sum of all views and cameras around.
 
-    A weight is the derivative of a pixel by the colour.
+    A weight is the derivative of a pixel with respect to the splat's colour.
     """
     bounds, found = views.bounds, torch.zeros(len(splats.means))
     centre = torch.tensor(bounds.centre)
@@ -195,10 +198,10 @@ def _weights(splats: Splats, views: Views) -> Float[Tensor, " splat"]:
 
 @checked
 def save_splats(splats: Splats, path: str | Path) -> Path:
-    """Write splats as PLY, which every viewer reads, or in the smaller format .splat, which has no colour by direction.
+    """Write splats as PLY, which every viewer reads, or as .splat, which is smaller but has no view-dependent colour.
 
     Args:
-        splats: with y up; the file has y down, see the module.
+        splats: with y up; the file has y down (see the module).
         path: ends in .ply or .splat.
 
     Returns:
@@ -210,7 +213,7 @@ def save_splats(splats: Splats, path: str | Path) -> Path:
     turned = replace(
         splats,
         means=splats.means * torch.tensor([1.0, -1.0, -1.0]),
-        quaternions=torch.nn.functional.normalize(torch.stack([-x, w, -z, y], -1), dim=-1),  # a half turn about x first
+        quaternions=torch.nn.functional.normalize(torch.stack([-x, w, -z, y], -1), dim=-1),  # after a half turn about x
         coefficients=(splats.coefficients.reshape(-1, 3, HARMONICS) * torch.tensor(HALF_TURN)).flatten(1),
     )
     write_whole(path, _ply(turned) if kind == "ply" else _splat(turned))
@@ -218,7 +221,7 @@ def save_splats(splats: Splats, path: str | Path) -> Path:
 
 
 def _ply(splats: Splats) -> bytes:
-    """The original code's properties: harmonics up to degree 3, of which the last are zero, and logarithms of sizes."""
+    """The original code's properties: harmonics up to degree 3, the last of them zero, and logarithms of scales."""
     number = len(splats.means)
     coefficients = splats.coefficients.reshape(number, 3, HARMONICS)
     rest = torch.cat([coefficients[..., 1:], torch.zeros(number, 3, 16 - HARMONICS)], -1).flatten(1)
@@ -237,7 +240,7 @@ def _ply(splats: Splats) -> bytes:
 
 
 def _splat(splats: Splats) -> bytes:
-    """32 bytes a splat: place, sizes, colour with opacity, and rotation; the most visible ones first."""
+    """32 bytes a splat: position, scales, colour with opacity, and rotation; the most visible ones first."""
     kind = np.dtype([("mean", "<f4", 3), ("size", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
     opacity = splats.logits.sigmoid()
     colour = splats.coefficients.reshape(-1, 3, HARMONICS)[..., 0] * MEAN

@@ -1,4 +1,4 @@
-"""A surface with a texture: fewer triangles, unwrapped by xatlas, coloured by the support views and by the field."""
+"""Textured meshes: simplified, unwrapped by xatlas, coloured from the support views and the field."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from hyperplanes.export.mesh import Surface
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.against import fading, margins
 from hyperplanes.geometry.rays import cast, pixel_grid
+from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.files import format_of
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
@@ -30,10 +32,10 @@ __all__ = ["TexturedSurface", "save_textured", "texture_surface"]
 
 FACES = 10_000
 SIZE = 1024
-TOLERANCE = 1.5  # pixels, on the surface, between a texel and what a view sees, for the view to count
-OBLIQUE = 0.2  # least cosine that the tolerance is divided by
-SHARPNESS = 4  # power of the cosine between normal and view by which views are weighted
-OF_FIELD = 0.02  # weight of the field's own colour beside that of one view straight from above
+TOLERANCE = 1.5  # largest distance between a texel and the surface that a view sees, in pixels
+OBLIQUE = 0.2  # smallest cosine by which the tolerance is divided
+SHARPNESS = 4  # exponent of the cosine between normal and view in the weights of views
+OF_FIELD = 0.02  # weight of the field's own colour, beside 1 of a view along the normal
 CHUNK = 1 << 15
 
 
@@ -42,10 +44,10 @@ class TexturedSurface:
     """A triangle mesh in world units with a texture, faces anticlockwise seen from outside.
 
     Attributes:
-        vertices: (vertex, 3); those at seams of the texture are there several times.
+        vertices: (vertex, 3); duplicated at seams of the texture.
         faces: (face, 3) vertex indices.
         normals: (vertex, 3) unit vectors that point outwards.
-        places: (vertex, 2) in the texture from 0 to 1: right, and up from its lowest row.
+        places: (vertex, 2) texture coordinates in [0, 1]: right, and up from the lowest row.
         texture: (height, width, 3) sRGB.
     """
 
@@ -60,22 +62,22 @@ class TexturedSurface:
 def texture_surface(
     surface: Surface, field: AdaptedField, views: Views, *, faces: int = FACES, size: int = SIZE
 ) -> TexturedSurface:
-    """The surface with a texture in place of colours a vertex.
+    """The surface with a texture instead of vertex colours.
 
-    A texel takes its colour from the views that see its place, those that look straight at it most, less where it lies
-    near a border that cuts the object; where none does, it is the field's as seen from straight above.
+    A texel takes its colour from the views that see its place, weighted by how frontally they see it, and less near
+    image borders that crop the object; where no view sees it, from the field as seen along the normal.
 
     Args:
         surface: of `extract_mesh`; simplified by quadric error where it has more faces.
-        field: that it was cut from.
+        field: that it was extracted from.
         views: the support views.
-        faces: at most so many triangles.
-        size: pixels along the longer side of the texture, about.
+        faces: most triangles.
+        size: approximate pixels along the longer side of the texture.
 
     Returns:
         The mesh.
     """
-    # fewer triangles, and their places in the texture
+    # simplification and texture coordinates
     solid = _simplified(surface, faces)
     vertices, normals = (np.array(part, np.float32) for part in (solid.vertices, solid.vertex_normals))
     origin, indices, places, height, width = _unwrapped(vertices, np.array(solid.faces, np.uint32), size)
@@ -86,7 +88,7 @@ def texture_surface(
     corners = mesh.faces[face]
     points = torch.from_numpy((mesh.vertices[corners] * shares[..., None]).sum(1))
     outward = normalize(torch.from_numpy((mesh.normals[corners] * shares[..., None]).sum(1)), dim=-1)
-    # a mean of what the field and the views show there
+    # weighted mean of the colours of field and views
     device = field.occupancy.occupied.device
     parts = zip(points.to(device).split(CHUNK), (-outward).to(device).split(CHUNK), strict=True)
     total = OF_FIELD * torch.cat([field(here, along)[0].cpu() for here, along in parts])
@@ -112,12 +114,12 @@ def _simplified(surface: Surface, faces: int) -> trimesh.Trimesh:
 def _unwrapped(
     vertices: npt.NDArray[np.float32], faces: npt.NDArray[np.uint32], size: int
 ) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint32], npt.NDArray[np.float32], int, int]:
-    """The vertex that each new one was, faces of new ones, their places, and height and width of the texture."""
+    """The original index of each new vertex, new faces, texture coordinates, and the texture's height and width."""
     import xatlas
 
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
     packing.resolution, packing.padding, packing.bilinear = size, 2, True
-    low, high = vertices.min(0), vertices.max(0)  # it leaves out faces below some area, whatever the unit is
+    low, high = vertices.min(0), vertices.max(0)  # xatlas drops faces below a fixed area
     atlas.add_mesh((vertices - low) / max(float((high - low).max()), np.finfo(np.float32).tiny), faces)
     atlas.generate(pack_options=packing)
     origin, indices, places = atlas[0]
@@ -125,7 +127,7 @@ def _unwrapped(
 
 
 def _texels(mesh: TexturedSurface) -> tuple[npt.NDArray[np.int64], ...]:
-    """The texels whose centres lie in a triangle, or beside one: row, column, face and barycentric coordinates."""
+    """The texels whose centres lie in a triangle, or on its border: row, column, face and barycentric coordinates."""
     height, width = mesh.texture.shape[:2]
     corners = mesh.places[mesh.faces].astype(np.float64) * [width, height] - 0.5  # (face, corner, 2), texel centres
     low = np.maximum(np.floor(corners.min(1)).astype(np.int64), 0)
@@ -153,7 +155,7 @@ def _texels(mesh: TexturedSurface) -> tuple[npt.NDArray[np.int64], ...]:
 def _distances(
     solid: trimesh.Trimesh, cameras: PinholeCamera, view: int, pixels: Float[Tensor, "pixel 2"]
 ) -> Float[Tensor, " pixel"]:
-    """The distance of the surface at every pixel, infinite beside it."""
+    """The distance of the surface at every pixel; infinite where there is none."""
     rays = cast(cameras, torch.full((len(pixels),), view), pixels)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
     found = solid.ray.intersects_id(origins, directions, multiple_hits=False, return_locations=True)
@@ -164,7 +166,7 @@ def _distances(
 
 
 def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views) -> Any:  # noqa: ANN401
-    """Yields for every view the colours (texel, 3) that it shows at points, and their weights (texel, 1)."""
+    """Yield the colours (texel, 3) of the points in each view, and their weights (texel, 1)."""
     height, width = views.size
     pixels, last = pixel_grid(height, width), torch.tensor([width - 1, height - 1])
     borders = torch.zeros(len(views), 4) if views.masks is None else margins(views.masks)
@@ -173,7 +175,7 @@ def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views)
         depth = _distances(solid, views.cameras, view, pixels).reshape(1, 1, height, width)
         edge = max_pool2d(depth, 3, 1, 1) + max_pool2d(-depth, 3, 1, 1)  # range of a pixel and its neighbours
         maps = torch.cat([depth, edge], 1).nan_to_num(nan=1e9, posinf=1e9)
-        pixel = 1 / float(camera.intrinsics(one)[0, 0, 0])  # its side, one unit away
+        pixel = 1 / float(camera.intrinsics(one)[0, 0, 0])  # its side at unit distance
         offsets = camera.centres(one) - points
         distance = offsets.norm(dim=-1)
         facing = (offsets / distance[:, None] * outward).sum(-1)
@@ -182,7 +184,7 @@ def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views)
         at = torch.where((local > 1e-6)[:, None], at, 2.0)[None, None]
         first, span = grid_sample(maps, at, mode="nearest", align_corners=True)[0, :, 0]
         tolerance = TOLERANCE * pixel * distance / facing.clamp_min(OBLIQUE)
-        visible = ((first - distance).abs() < tolerance) & (span < 3 * tolerance)  # and no edge beside it
+        visible = ((first - distance).abs() < tolerance) & (span < 3 * tolerance)  # and no depth edge beside it
         colour = grid_sample(views.images[view : view + 1], at, padding_mode="border", align_corners=True)[0, :, 0].T
         shown = 1 - fading(borders[[view]], at[0, 0, :, None].clamp(-1, 1), views.size)
         yield colour, facing.clamp_min(0)[:, None] ** SHARPNESS * visible[:, None] * shown
@@ -191,7 +193,7 @@ def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views)
 def _spread(
     texture: npt.NDArray[np.float32], row: npt.NDArray[np.int64], column: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.uint8]:
-    """Texels that no triangle covers take the nearest colour, so that interpolation at seams meets no black."""
+    """Fill texels outside all triangles with the nearest colour, so that no black is interpolated at seams."""
     from scipy.ndimage import distance_transform_edt
 
     empty = np.ones(texture.shape[:2], bool)
@@ -200,17 +202,18 @@ def _spread(
     return np.round(texture[tuple(np.asarray(nearest))] * 255).astype(np.uint8)
 
 
+@checked
 def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
-    """Write a textured surface as GLB with normals and an unlit material, which every viewer shows as photographed.
+    """Write a textured surface as GLB with normals and an unlit material, which viewers show as photographed.
 
-    Viewers that do not know unlit materials see one without metal and gloss.
+    Viewers without support for unlit materials see a matte, non-metallic one.
 
     Args:
-        mesh: what to write.
-        path: of the file.
+        mesh: the mesh to write.
+        path: ends in .glb.
 
     Returns:
-        The file.
+        The file. Another ending is a ValueError.
     """
     import trimesh
     from PIL import Image
@@ -218,6 +221,8 @@ def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
+    path = Path(path)
+    format_of(path, ("glb",))
     material = PBRMaterial(baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0)
     visual = TextureVisuals(uv=mesh.places, material=material)
     solid = trimesh.Trimesh(
@@ -231,6 +236,5 @@ def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
     buffer = io.BytesIO()
     scene = trimesh.Scene(solid)
     buffer.write(export_glb(scene, include_normals=True, tree_postprocessor=unlit))
-    path = Path(path)
     write_whole(path, buffer.getvalue())
     return path

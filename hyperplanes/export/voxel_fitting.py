@@ -1,4 +1,4 @@
-"""Baked voxels fitted to posed images by gradient descent on their densities and coefficients of colour."""
+"""Fitting of baked voxels to posed images by gradient descent on densities and colour coefficients."""
 
 from __future__ import annotations
 
@@ -22,32 +22,33 @@ from hyperplanes.views import Views
 __all__ = ["STEPS", "fit_voxels", "render_guide"]
 
 STEPS = 100
-PIXELS = 8192  # of a step
-EDGE = 0.25  # difference of a pixel to one beside it, in colour or mask, from which on it is the mean of five rays
+PIXELS = 8192  # per step
+EDGE = 0.25  # difference of neighbouring pixels in colour or mask from which on a pixel is the mean of five rays
 DENSITY_RATE = 0.05  # of optical depth through a voxel
 COLOUR_RATE = 0.01
-DECAY = 0.1  # of both rates, from the first step to the last
-STOP = 0.01  # transmittance below which a ray is finished: what lies behind has next to no gradient
+DECAY = 0.1  # factor of both rates from the first step to the last
+STOP = 0.01  # transmittance below which a ray ends: gradients behind are negligible
 SMALLEST_DEPTH = 1e-4  # of a voxel: colour has no gradient where density is zero
-LARGEST_DEPTH = 0.7  # of a voxel at first: what is opaque hides the voxels behind, and has no gradient itself
-ENOUGH = 16  # views by which voxels are fitted without a guide
+LARGEST_DEPTH = 0.7  # of a voxel at first: an opaque one hides those behind it and has no gradient itself
+ENOUGH = 16  # number of views from which on voxels are fitted without a guide
 
 
 def render_guide(
     source: AdaptedField | BakedScene, views: Views, *, size: tuple[int, int] | None = None
 ) -> Views | None:
-    """Views from all around the object, as the second source of `fit_voxels` and `fit_splats` of few shown views.
+    """Renderings from all around the object that guide `fit_voxels` and `fit_splats` where there are few views.
 
-    Fitted to a few views alone, voxels show them and little else. Two chairs have 20.6 dB as baked from three views,
-    18.7 fitted, 20.5 with the guide (`python -m benchmarks baked --data data/chairs --counts 3 --objects 2 --query 4`).
+    Fitted to a few views alone, voxels overfit. Two chairs have 20.6 dB as baked from three views, 18.7 fitted, 20.5
+    with the guide (`python -m benchmarks baked --data data/chairs --counts 3 --objects 2 --query 4`).
 
     Args:
         source: the field that voxels were baked from, or the voxels that splats are made of.
-        views: posed images that it was adapted to.
-        size: height and width of the renderings; half those of the views where absent.
+        views: the support views.
+        size: height and width of the renderings; half those of the views where absent, but `fit_splats` needs
+            `views.size`.
 
     Returns:
-        Sixteen views, as far from the object as the given ones; None where these are sixteen or more.
+        Sixteen views, as far from the object as the given ones on average; None where these are sixteen or more.
     """
     if len(views) >= ENOUGH:
         return None
@@ -78,22 +79,23 @@ def fit_voxels(
 ) -> BakedField:
     """The voxels after gradient steps (Adam) on the squared error of pixels of the views.
 
-    A field loses 1 to 3 dB by being baked, since voxels interpolate what a network and lookups computed; fitting the
-    voxels brings them back, and more with 25 views. Pixels at edges are the mean of five rays, as they are rendered: by
-    one ray a pixel surfaces become soft. No voxel is added or taken away. Steps begin with an optical depth of at most
-    LARGEST_DEPTH a voxel. What both are worth: docs/benchmarks.md, "Baked voxels".
+    Baking costs a field 1 to 3 dB, since voxels interpolate what a network and lookups computed; fitting the voxels
+    recovers them, and more with 25 views. Pixels at edges are the mean of five rays, as in rendering: with one ray a
+    pixel, surfaces become soft. No voxel is added or removed. Fitting begins with an optical depth of at most
+    LARGEST_DEPTH a voxel. For measurements of both see docs/benchmarks.md, "Baked voxels".
 
     Args:
-        baked: where it starts; on the CPU.
+        baked: the initial voxels, on the CPU.
         views: posed images of the object, on any device.
-        guide: renderings of the field from other places, from `render_guide`; the fewer views, the more of its pixels.
+        guide: renderings of the field from other places, by `render_guide`; the fewer views, the more of its pixels are
+            drawn.
         steps: gradient steps.
-        pixels: of each step, drawn from all views; no more than there are that show something.
-        seed: of the pixels.
-        on_step: told the number of steps done.
+        pixels: per step, drawn from all views; at most those that may show a voxel.
+        seed: for drawing pixels.
+        on_step: called with the number of steps done.
 
     Returns:
-        Voxels at the same places.
+        The same voxels with fitted values.
     """
     scene, voxel = BakedScene(baked), 2 * baked.bounds.radius / baked.side
     share = max(0.0, 1 - len(views) / ENOUGH) if guide is not None else 0.0
@@ -102,17 +104,17 @@ def fit_voxels(
         sources.append(_Source.of(guide, scene, pixels, share))
     if not steps or not sum(source.pixels for source in sources):
         return baked
-    # optical depth of a voxel and coefficients, each with its own rate
+    # optical depths of voxels and coefficients, each with its own learning rate
     depth, colour = (baked.values[:, :1] * voxel).clamp(SMALLEST_DEPTH, LARGEST_DEPTH), baked.values[:, 1:].clone()
     groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
     descent = Adam(groups, betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, DECAY ** (1 / max(1, steps)))
-    # what the kernel reads and writes: fresh memory for each step takes longer to get than to fill
+    # reused by the kernel: allocating memory in each step would take longer than filling it
     values, gradients = baked.values.clone(), torch.empty(torch.get_num_threads(), *baked.values.shape)
     depth.grad, colour.grad = torch.zeros_like(depth), torch.zeros_like(colour)
     generator = torch.Generator().manual_seed(seed)
     for step in range(steps):
-        # squared error of some rays, and its gradient by the kernel
+        # gradient of the squared error of some rays, by the kernel
         drawn, truth, counts = _draw(sources, generator)
         values[:, :1], values[:, 1:], basis = depth / voxel, colour, spherical_harmonics(drawn.directions)
         _, gradient = voxel_gradients(
@@ -130,7 +132,7 @@ def fit_voxels(
 
 @dataclass(frozen=True)
 class _Source:
-    """Views, those of their pixels that may show a voxel, which of these lie at edges, and how many a step draws."""
+    """Views, the pixels that may show a voxel, which of these lie at edges, and how many are drawn per step."""
 
     views: Views
     live: Int[Tensor, " pixel"]
@@ -139,7 +141,7 @@ class _Source:
 
     @classmethod
     def of(cls, views: Views, scene: BakedScene, pixels: int, share: float) -> _Source:
-        """With a share of the pixels, and no more than there are that show something."""
+        """Draw a share of the pixels per step, at most those that may show a voxel."""
         views = replace(views.to("cpu", torch.float32), bounds=scene.field.bounds)
         live = scene.footprint(views.cameras).flatten().nonzero()[:, 0]
         seen = views.images if views.masks is None else torch.cat([views.images, views.masks], 1)
@@ -147,11 +149,11 @@ class _Source:
         return cls(views, live, at_edge, min(round(share * pixels), len(live)))
 
     def draw(self, generator: torch.Generator) -> tuple[Rays, Tensor, Tensor]:
-        """Rays of some pixels, pixel after pixel, their true colours, and how many rays each pixel has."""
+        """Rays of random pixels, pixel by pixel, the pixels' true colours, and their numbers of rays."""
         drawn = torch.randint(len(self.live), (self.pixels,), generator=generator)
         at_edge = self.at_edge[drawn]
         counts = torch.where(at_edge, len(EDGE_SUBPIXELS), 1)
-        # one ray through each centre, and through the other places of pixels at edges
+        # one ray through each centre, and one through each other subpixel of pixels at edges
         centre, truth, _ = self.views.rays_at(self.live[drawn])
         others, _, _ = self.views.rays_at(self.live[drawn[at_edge]], subpixels=EDGE_SUBPIXELS[1:])
         pixel = torch.arange(len(drawn))
@@ -160,6 +162,6 @@ class _Source:
 
 
 def _draw(sources: Sequence[_Source], generator: torch.Generator) -> tuple[Rays, Tensor, Tensor]:
-    """As `_Source.draw`, of all sources."""
+    """`_Source.draw` for all sources."""
     rays, truth, counts = zip(*(source.draw(generator) for source in sources if source.pixels), strict=True)
     return join_rays(*rays), torch.cat(truth), torch.cat(counts)

@@ -1,4 +1,4 @@
-"""What counts against the views of a point: how far it lies behind what they see, their masks, and borders that cut."""
+"""View penalties for a point: depth behind the visible surface, incomplete masks, borders that crop the object."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from hyperplanes.geometry.chosen_views import BEYOND, CUT, MARGIN, WHOLE, Penalt
 
 __all__ = ["Against", "fading", "margin", "margins"]
 
-CUTTING = 0.02  # of the shorter side of a picture: as many pixels of the object along a border are cut by it
+CUTTING = 0.02  # of the shorter side: a border with that many object pixels along it crops the object
 
 
 @dataclass(frozen=True)
 class Against:
-    """What counts against the views of planes.
+    """The penalties of the views of planes.
 
     Attributes:
-        handicaps: added to the penalty of each wherever it shows a point.
+        handicaps: added to the penalty of each view wherever it shows a point.
         margins: as `margins` returns them.
-        penalties: how much counts.
+        penalties: costs of depth and of masks.
     """
 
     handicaps: Float[Tensor, " view"]
@@ -33,7 +33,7 @@ class Against:
 
     @cached_property
     def _cut(self) -> bool:
-        """Whether a border cuts the object in any view."""
+        """Whether a border crops the object in any view."""
         return bool(self.margins.any())
 
     def penalty(
@@ -43,13 +43,13 @@ class Against:
         coordinates: Float[Tensor, "point view 2"],
         size: Sequence[int],
     ) -> Float[Tensor, "point view"]:
-        """The penalty of each view that shows a point; `visibility.choose` has the same as a kernel.
+        """The penalty of each view that shows a point; the kernel `visibility.choose` computes the same.
 
         Args:
-            behind: how far the point lies behind the surface that the view sees, in radii beyond the tolerance.
+            behind: depth of the point behind the surface that the view sees, less the tolerance, in radii.
             coverage: the opacity of its mask there.
             coordinates: as in `fading`.
-            size: likewise.
+            size: as in `fading`.
         """
         own = self.penalties
         penalty = (own.steep * behind).clamp(own.least, own.deepest)
@@ -61,14 +61,14 @@ class Against:
 
 
 def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 4"]:
-    """The pixels from the left, right, upper and lower border of each picture within which it fades out.
+    """Width of the fade-out at the left, right, upper and lower border of each picture, in pixels.
 
     Args:
-        masks: opacity in [0, 1]. A border cuts the object where it has some pixels that are whole, not one (of a mask
-            that is not clean, or UNKNOWN as in a reflection).
+        masks: opacity in [0, 1]. A border crops the object where several of its pixels are opaque; a single one may be
+            noise, and UNKNOWN ones, of reflections, do not count.
 
     Returns:
-        0 where a border does not cut the object.
+        Widths; 0 at borders that do not crop the object.
     """
     height, width = masks.shape[2:]
     whole = masks[:, 0] >= WHOLE
@@ -78,7 +78,7 @@ def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 
 
 
 def fading(margins: Float[Tensor, "view 4"], coordinates: Float[Tensor, "point view 2"], size: Sequence[int]) -> Tensor:
-    """How far into a margin points lie: 0 inside of all, 1 at the border (point, view).
+    """How far points lie in a fade-out margin (point, view): 0 inside all margins, 1 at the border.
 
     Args:
         margins: of `margins`.

@@ -2,8 +2,8 @@
 
 Conventions of the whole package: OpenCV axes (x right, y down, z forward), extrinsics are camera_from_world, pixel
 (0, 0) is centred at (0, 0), so that a centred principal point is ((W - 1) / 2, (H - 1) / 2). Every function returns a
-new `PinholeCamera` with storage (view, 4, 4); none changes its argument. The functions of `poses` are names of this
-module too.
+new `PinholeCamera` with storage (view, 4, 4); none changes its argument. `look_at`, `orbit`, `fibonacci_sphere` and the
+conversions of axes of `poses` can be imported from here, too.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ def pinhole(
         Cameras with storage (view, 4, 4), dtype and device of `camera_from_world`.
 
     Raises:
-        ValueError: a shape, a value that is not finite, a focal length that is not positive, or a block that is no
-            rotation.
+        ValueError: a shape, a value that is not finite, a focal length that is not positive, or a block that is not
+            a rotation.
 
     >>> cameras = pinhole(symmetric_intrinsics(64, 64, 0.7), torch.eye(4)[None], 64, 64)
     >>> cameras.project(torch.tensor([[[0.0, 0.0, 2.0]]])).flatten().tolist()
@@ -104,7 +104,7 @@ def _check_size(height: int, width: int) -> None:
 
 
 def _size_dtype(dtype: torch.dtype) -> torch.dtype:
-    """That of heights and widths beside other numbers: halves would round them from 257 or 2,049 pixels on."""
+    """The dtype of heights and widths: half precision would round them from 257 (bfloat16) or 2,049 pixels on."""
     return torch.promote_types(dtype, torch.float32)
 
 
@@ -117,7 +117,7 @@ def _check_numbers(calibration: Tensor, pose: Tensor) -> None:
     if (focal <= 0).any():
         view = int((focal <= 0).any(-1).nonzero()[0])
         raise ValueError(f"intrinsics: expected positive focal lengths, got {focal[view].tolist()} in view {view}")
-    rotation = pose[:, :3, :3] if pose.element_size() > 2 else pose[:, :3, :3].float()  # no determinant of halves
+    rotation = pose[:, :3, :3] if pose.element_size() > 2 else pose[:, :3, :3].float()  # det has no half precision
     identity = torch.eye(3, dtype=rotation.dtype, device=pose.device)
     error = (rotation @ rotation.mT - identity).abs().flatten(1).amax(1)
     wrong = (error > ROTATION_TOLERANCE) | (torch.linalg.det(rotation) < 0)
@@ -193,7 +193,7 @@ def centres(cameras: PinholeCamera) -> Float[Tensor, "view 3"]:
 
 
 def camera_directions(cameras: PinholeCamera, centre: tuple[float, float, float]) -> Float[Tensor, "view 3"]:
-    """Unit vectors from a point, such as the centre of a scene, to the cameras; zero for a camera that is there.
+    """Unit vectors from a point, such as the centre of a scene, to the cameras; zero for a camera at the point.
 
     >>> camera = pinhole(torch.eye(3), look_at(torch.tensor([[0.0, 0.0, 3.0]])), 1, 1)
     >>> camera_directions(camera, (0.0, 0.0, 1.0)).tolist()
@@ -204,11 +204,11 @@ def camera_directions(cameras: PinholeCamera, centre: tuple[float, float, float]
 
 
 def least_depth(cameras: PinholeCamera) -> float:
-    """The depth in the frame of a camera from which on a point lies before it, in world units.
+    """The least depth at which a point counts as in front of a camera, in world units.
 
-    It is MIN_Z of how far the cameras stand from their middle on average, so that a scene gives the same picture in
-    metres and in micrometres. Cameras in one place do not tell how large their scene is, and the world's origin may be
-    far away: for them it is what rounding leaves of their distance from it, and MIN_Z where they stand there.
+    It is MIN_Z times the mean distance of the cameras from their centroid, so that a scene gives the same picture in
+    metres and in micrometres. Cameras in one place do not tell the size of their scene: for them it is the rounding
+    error of their distance from the world's origin, or MIN_Z if they stand there.
 
     >>> least_depth(pinhole(torch.eye(3), orbit(4, 2.0, 0.0), 1, 1))
     0.0002
@@ -245,7 +245,7 @@ def _with_lens_of(cameras: PinholeCamera, bare: PinholeCamera) -> PinholeCamera:
 
 @checked
 def select(cameras: PinholeCamera, index: Selection) -> PinholeCamera:
-    """The cameras at `index`, in that order, or those for which it is True. Indices of none raise ValueError."""
+    """The cameras at `index`, in that order, or those for which it is True. An index out of range raises ValueError."""
     chosen = as_selection(index, cameras.batch_size, "cameras")
     return _rebuilt(cameras, lambda value: value[chosen])
 
@@ -279,7 +279,7 @@ def to(
 ) -> PinholeCamera:
     """The cameras on another device or in another precision; sizes of pictures are in single precision at least.
 
-    A type of whole numbers, which would round rotations to 0 and 1, raises ValueError.
+    An integer type, which would round rotations to 0 and 1, raises ValueError.
     """
     check_precision(dtype)
     of_size = None if dtype is None else _size_dtype(dtype)
@@ -300,7 +300,7 @@ def with_poses(cameras: PinholeCamera, camera_from_world: Float[Tensor, "view 4 
 @checked
 @without_autocast
 def moved(cameras: PinholeCamera, motion: Float[Tensor, "4 4"]) -> PinholeCamera:
-    """The cameras after a rigid motion of the world, in float64, which they take part in."""
+    """The cameras moved together with the world by a rigid motion (a float64 matrix)."""
     pose = camera_from_world(cameras)
     return with_poses(cameras, pose @ torch.linalg.inv(motion).to(pose))
 
@@ -309,7 +309,7 @@ def moved(cameras: PinholeCamera, motion: Float[Tensor, "4 4"]) -> PinholeCamera
 def cropped(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     """The cameras of images whose right and lower borders were moved; calibration and distortion stay.
 
-    A size of no pixel raises ValueError.
+    A size below one pixel raises ValueError.
     """
     _check_size(height, width)
     bare = PinholeCamera(
@@ -326,7 +326,7 @@ def resized(cameras: PinholeCamera, height: int, width: int) -> PinholeCamera:
     """The cameras of the same images scaled to another size.
 
     The image borders, not the pixel centres, stay in place: c' = s (c + 1/2) - 1/2, which is not what
-    `PinholeCamera.scale` does. A size of no pixel raises ValueError.
+    `PinholeCamera.scale` does. A size below one pixel raises ValueError.
 
     >>> small = pinhole(symmetric_intrinsics(64, 64, 0.7), torch.eye(4)[None], 64, 64)
     >>> intrinsics(resized(small, 128, 128))[0, :2, 2].tolist()

@@ -1,4 +1,4 @@
-"""Which views see points, and how well: what `visibility.VisibilityPlanes` answers, and by what it judges."""
+"""Which views see points, and how well: parameters and results of `visibility.VisibilityPlanes`."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ __all__ = [
     "Visibility",
 ]
 
-DEEPEST = 2.0  # radii
-PARTLY = 2.0  # penalty of a mask that is not whole
-WHOLE = 0.98  # opacity of a mask from which on it counts as whole
+DEEPEST = 2.0  # largest penalty of depth behind the surface, in radii
+PARTLY = 2.0  # penalty of a mask that is not opaque
+WHOLE = 0.98  # opacity from which on a mask counts as opaque
 UNSEEN = 8.0  # penalty of a view that does not show the point: more than all others together
-MARGIN = 0.15  # of the shorter side of a picture, along a border that cuts the object
+MARGIN = 0.15  # of the shorter side of a picture, along a border that crops the object
 CUT = 0.03  # penalty in the middle of the margin; 3 at the border
-BEYOND = 1.01  # margins from where it begins, at which the penalty would be infinite
-FADING = 10.0  # of the weights of views, with their penalty
-ANGLE = 10.0  # radians of angle that a penalty of 1 counts for
+BEYOND = 1.01  # widths of the margin from its inner edge to where the penalty would be infinite
+FADING = 10.0  # rate at which the weights of views fall with their penalty
+ANGLE = 10.0  # radians of angle that a penalty of 1 is worth
 OCTAVES = 8  # of an encoding from one computed sine to the next; the others follow by doubling the angle
-SMALLEST_ANGLE = 1e-2  # between a view and a direction, in radians: nearer ones count as that far
+SMALLEST_ANGLE = 1e-2  # between a view and a direction, in radians; smaller ones are clamped to it
 
 
 @dataclass(frozen=True)
 class Penalties:
-    """What counts against a view that does not see a point well; ANGLE radians of angle each.
+    """What it costs a view not to see a point well; a cost of 1 is worth ANGLE radians of angle.
 
     Attributes:
-        deepest: the most that a point behind the first surface costs.
-        partly: what a mask costs that is not whole.
-        steep: cost of a radius behind the surface.
-        highest: of both together.
-        least: of a point before the surface.
+        deepest: largest cost of depth behind the first surface.
+        partly: cost of a mask that is not opaque.
+        steep: cost of each radius behind the surface.
+        highest: largest cost of both together.
+        least: lowest cost, of points in front of the surface.
     """
 
     deepest: float = DEEPEST
@@ -60,7 +60,7 @@ class Penalties:
 
     @classmethod
     def alike(cls) -> Penalties:
-        """A view sees a point or does not: whatever hides it costs 1; handicaps and margins count beside that."""
+        """Visibility is binary: whatever hides a point costs 1; handicaps and margins are added."""
         return cls(deepest=1e3, partly=1e6, steep=1e6, highest=1.0, least=0.0)
 
 
@@ -72,7 +72,7 @@ class ChosenViews:
         views: their indices.
         directions: unit vectors from each camera's centre to the point, in the world.
         behind: how far the point lies behind the first surface of the hull along the ray of each camera, in radii of
-            the scene; negative before it.
+            the scene; negative in front of it.
         coverage: opacity of the mask where the point falls.
         penalty: how badly the view sees the point; UNSEEN where it does not show it at all.
     """
@@ -85,7 +85,7 @@ class ChosenViews:
 
     @property
     def valid(self) -> Bool[Tensor, "point chosen"]:
-        """Whether each view shows the point: it falls into the image, and the view is not hidden."""
+        """Whether each view shows the point: it falls into the image, and the view is not masked."""
         return self.penalty < UNSEEN
 
     @property
@@ -95,7 +95,7 @@ class ChosenViews:
         return weights / weights.sum(1, keepdim=True).clamp_min(1e-6)
 
     def first(self, count: int) -> ChosenViews:
-        """The first of the views.
+        """The first views.
 
         Args:
             count: how many; all where there are fewer.
@@ -103,7 +103,7 @@ class ChosenViews:
         return ChosenViews(*(getattr(self, each.name)[:, :count] for each in fields(self)))
 
     def angles(self, directions: Float[Tensor, "point 3"]) -> Float[Tensor, "point chosen"]:
-        """Between a direction at each point and the ray of each view, in radians."""
+        """Angles between a direction at each point and the ray of each view, in radians."""
         return torch.acos((self.directions * directions[:, None]).sum(-1).clamp(-1 + 1e-6, 1 - 1e-6))
 
     def lumigraph_weights(self, angles: Float[Tensor, "point chosen"], count: int) -> Float[Tensor, "point blended"]:
@@ -114,7 +114,7 @@ class ChosenViews:
         does not see the point counts as one at a greater angle.
 
         Args:
-            angles: of `angles`.
+            angles: as `angles` returns them.
             count: how many views are blended.
         """
         score = (angles + ANGLE * self.penalty.clamp_min(0)).clamp_min(SMALLEST_ANGLE)
@@ -128,9 +128,9 @@ class Visibility:
 
     Attributes:
         best: the views that see each point best.
-        nearest: those of similar viewing direction, which see it, one more than was asked for where there are so many.
+        nearest: the views nearest to the direction that see the point, one more than asked for where there are enough.
         coverage: the least opacity over the views that show the point; 1 where none does.
-        number: of the views that show the point.
+        number: number of views that show the point.
     """
 
     best: ChosenViews
@@ -141,14 +141,14 @@ class Visibility:
 
 @dataclass(frozen=True)
 class Reading:
-    """How a network reads views.
+    """How many views a network reads, and how they are encoded.
 
     Attributes:
-        best: views of the least penalty; 0 reads none of them.
-        nearest: views nearest to a direction.
-        point_frequencies: of the encoded point.
-        direction_frequencies: of the encoded direction.
-        falloff: of depths behind the hull, in 1 / radii, where tanh makes them inputs.
+        best: number of views of least penalty, or 0.
+        nearest: number of views nearest to a direction.
+        point_frequencies: frequencies of the encoded point.
+        direction_frequencies: frequencies of the encoded direction.
+        falloff: factor of depths behind the hull in the tanh that makes them inputs, in 1 / radii.
     """
 
     best: int
@@ -159,18 +159,18 @@ class Reading:
 
     @property
     def row_size(self) -> int:
-        """The encoded point, nine numbers of each of the best views, eleven of all of them."""
+        """Length of a row: the encoded point, nine numbers for each of the best views, eleven for all of them."""
         return 3 + 6 * self.point_frequencies + 9 * self.best + 11
 
     @property
     def near_size(self) -> int:
-        """The encoded direction, and seven numbers of each of the nearest views."""
+        """Length of a near row: the encoded direction, and seven numbers for each of the nearest views."""
         return 3 + 6 * self.direction_frequencies + 7 * self.nearest
 
 
 @dataclass(frozen=True)
 class Described:
-    """What a network reads of points, in rows.
+    """What a network reads of each point, as rows.
 
     Attributes:
         rows: the encoded point; colour in [-1, 1], depth behind the hull, coverage, validity and direction of each of
@@ -178,7 +178,7 @@ class Described:
             number of views; features of a grid.
         coverage: the least opacity over the views that show the point.
         near_rows: the encoded direction; colour, angle, depth, coverage and validity of each of the nearest views.
-        near_weights: logarithms of the weights of the blend (`fields.image_based`).
+        near_weights: logarithms of the blending weights (`fields.image_based`).
         near_colours: in [0, 1], white where a view does not show the point.
     """
 

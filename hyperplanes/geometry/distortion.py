@@ -104,11 +104,11 @@ def distorted_pixels(
 ) -> tuple[Float[Tensor, "point view 2"], Tensor]:
     """Distorted pixels of ideal ones, and whether the distortion is defined there (OpenCV's model).
 
-    Beyond the radius at which the radial polynomial turns back, the model would map points into the image that no lens
-    shows there.
+    Beyond the radius at which the radial polynomial turns back, the model maps points into the image that the lens
+    does not show there.
 
     Args:
-        cameras: all of them.
+        cameras: the batch.
         pixels: of the pinhole without its lens.
         views: index of the camera of each entry; the columns in order where absent.
 
@@ -132,7 +132,7 @@ def undistorted_pixels(
     """Pixels of the pinhole without its lens: the inverse of `distorted_pixels`, differentiable in all of them.
 
     Args:
-        cameras: all of them.
+        cameras: the batch.
         view: index of the camera of each pixel.
         pixels: in the image.
 
@@ -153,16 +153,16 @@ def inverse_distortion(
     limit: Float[Tensor, " point"],
     tolerance: float | Float[Tensor, " point"] = 1e-6,
 ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
-    """Which points of the plane z = 1 a lens moves to the given ones.
+    """The points of the plane z = 1 that a lens maps to the given ones.
 
-    The radius is bracketed by bisection within the turning radius, without the tangential part; Newton's method on both
-    coordinates goes on from there.
+    The radius is bracketed by bisection within the turning radius, without the tangential part; then Newton's method
+    refines both coordinates.
 
     Args:
-        points: where the lens shows something, in units of the focal length.
+        points: distorted points, in units of the focal length.
         coefficients: k1, k2, p1, p2, k3, or with k4, k5, k6 of OpenCV's rational model.
         limit: turning radius of each point's lens; beyond it the model folds back.
-        tolerance: the largest distance between what the lens makes of the result and the given point.
+        tolerance: largest distance between the distorted result and the given point.
 
     Returns:
         The points, with the gradient of the inverse, and whether they are within the tolerance and before the fold.
@@ -182,7 +182,7 @@ def inverse_distortion(
 
 
 def _radial_inverse(points: Tensor, lens: Tensor, limit: Tensor) -> Tensor:
-    """Points whose radius, by the radial part alone, becomes that of the given ones, or as near as it comes."""
+    """Points that the radial part alone maps to the radius of the given ones, or as near to it as possible."""
     wanted = points.norm(dim=-1)
 
     def shown(radius: Tensor) -> Tensor:
@@ -199,7 +199,7 @@ def _radial_inverse(points: Tensor, lens: Tensor, limit: Tensor) -> Tensor:
 
 
 def _newton_step(ideal: Tensor, points: Tensor, lens: Tensor) -> Tensor:
-    """One step towards the points that the lens moves to the given ones; none where the lens is flat."""
+    """One step towards the points that the lens maps to the given ones; none where its Jacobian is singular."""
     moved, jacobian = _lens(ideal, lens)
     a, b, c, d = jacobian.detach().flatten(1).unbind(1)
     determinant = a * d - b * c
@@ -219,7 +219,7 @@ def _radial(square: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _lens(points: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
-    """OpenCV's model at points (point, 2): where they are moved to, and the derivative (point, 2, 2)."""
+    """OpenCV's model at points (point, 2): the distorted points, and the Jacobian (point, 2, 2)."""
     x, y = points.unbind(-1)
     p1, p2 = lens[..., 2], lens[..., 3]
     square = x * x + y * y

@@ -21,10 +21,10 @@ from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["first_hits"]
 
-STEPS = 128  # along a diameter of the scene, where rays look for their first occupied voxel
-ROUND = 8  # of them at once, without a compiler
-ROWS = 16  # of pixels that one call of the kernel works on
-RAYS_AT_ONCE = 1 << 17  # that are cast together, without a compiler: those of many photographs would take gigabytes
+STEPS = 128  # samples along a diameter of the scene
+ROUND = 8  # samples tested at once, without compiled kernels
+ROWS = 16  # rows of pixels per kernel call
+RAYS_AT_ONCE = 1 << 17  # cast together, without compiled kernels: those of many photographs would take gigabytes
 
 
 @torch.no_grad()
@@ -36,11 +36,11 @@ def first_hits(
     Args:
         occupancy: the grid.
         cameras: of one image size.
-        masks: (view, 1, height, width); where they are 0 nothing is looked for.
+        masks: (view, 1, height, width); pixels where they are 0 are skipped.
 
     Returns:
-        Distances along unit rays, to half a STEPS-th of the scene's diameter; where there is nothing, that of the far
-        end of the ray in the scene's sphere, or of the sphere's centre plus its radius.
+        Distances along unit rays, exact to half a STEPS-th of the scene's diameter. A ray that hits nothing has the
+        distance at which it leaves the scene's sphere, a skipped pixel that of the sphere's centre plus its radius.
     """
     height, width = camera.image_size(cameras)
     centres, bounds = camera.centres(cameras), occupancy.bounds
@@ -61,7 +61,7 @@ def first_hits(
 
 
 def _find_compiled(occupancy: Occupancy, cameras: PinholeCamera, masks: Tensor, result: Tensor) -> None:
-    """Writes the distances of the pixels whose masks are above 0 into `result`, by the compiled kernel."""
+    """Write the distances of the pixels whose masks are above 0 into `result`, by the compiled kernel."""
     bounds, matrix = occupancy.bounds, camera.intrinsics(cameras).flatten(1)
     rotation = camera.camera_from_world(cameras)[:, :3, :3].flatten(1)
     numbers = torch.cat([camera.centres(cameras), rotation, matrix[:, [0, 4, 2, 5, 1]]], 1)
@@ -79,7 +79,7 @@ def _find_compiled(occupancy: Occupancy, cameras: PinholeCamera, masks: Tensor, 
 
 
 def _without_lenses(cameras: DistortedCamera, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Where each pixel of each view would be without lens distortion, and whether it is anywhere (`cast`)."""
+    """The undistorted position of each pixel of each view, and whether it has one."""
     grid = pixel_grid(height, width)
     found = [undistorted_pixels(cameras, view.expand(len(grid)), grid) for view in torch.arange(cameras.batch_size)]
     pixels, shown = (torch.stack(part).unflatten(1, (height, width)) for part in zip(*found, strict=True))
@@ -87,7 +87,7 @@ def _without_lenses(cameras: DistortedCamera, height: int, width: int) -> tuple[
 
 
 def _hits_torch(occupancy: Occupancy, rays: Rays) -> Float[Tensor, " ray"]:
-    """The distances, in plain PyTorch: ROUND steps of all rays that are left at once."""
+    """The distances, in plain PyTorch: ROUND samples at a time of all rays that have hit nothing yet."""
     step, device = 2 * occupancy.bounds.radius / STEPS, rays.near.device
     nearest, left = rays.far.clone(), torch.arange(len(rays), device=device)
     for first in range(0, STEPS + 1, ROUND):

@@ -1,4 +1,4 @@
-"""The visual hull of masks itself, and not only the voxels that it enters: where rays meet it, and what lies in it."""
+"""The visual hull by the masks themselves, which is finer than its voxels: where rays enter it, and what is inside."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from hyperplanes.geometry.visibility import VisibilityPlanes
 
 __all__ = ["centres_in_hull", "hull_hits"]
 
-RAYS, LAYERS = 512, 2  # of rays and of voxels, that one call of a kernel works on
-POINTS = 1 << 14  # in one call, without a compiler
+RAYS, LAYERS = 512, 2  # rays, and layers of voxels, per kernel call
+POINTS = 1 << 14  # per call, without compiled kernels
 
 
 @torch.no_grad()
@@ -30,18 +30,18 @@ def hull_hits(
     voxels: Occupancy,
     opacity: float,
 ) -> Float[Tensor, " ray"]:
-    """The first samples of rays in the visual hull, by one kernel; `planes.has_kernels` says of which points.
+    """The first sample of each ray in the visual hull, by a compiled kernel (see `planes.has_kernels`).
 
     Args:
-        planes: the views whose masks are the hull.
-        rays: with far.
-        first: distance of the first sample of each.
-        step: from one sample to the next.
+        planes: views whose masks define the hull.
+        rays: their origins, directions and far are read.
+        first: distance of the first sample of each ray.
+        step: distance between samples.
         voxels: a sample lies in the hull only where these are occupied.
-        opacity: that every view which shows a sample has there at least.
+        opacity: least mask opacity at a sample in every view that shows it.
 
     Returns:
-        Their distances along the rays; infinite where there is none.
+        Distances along the rays; infinite where no sample lies in the hull.
     """
     cameras, bounds, shape = planes.shown_cameras(), voxels.bounds, planes.maps.shape
     arrays = [each.contiguous().numpy() for each in (rays.origins, rays.directions, first, rays.far)]
@@ -62,8 +62,8 @@ def centres_in_hull(planes: VisibilityPlanes, opacity: float) -> Occupancy:
     """The occupied voxels of the planes whose centres lie in the hull.
 
     Args:
-        planes: the views whose masks are the hull, and voxels that it enters.
-        opacity: that every view which shows a centre has there at least.
+        planes: views whose masks define the hull, with the voxels to test.
+        opacity: least mask opacity at a centre in every view that shows it.
     """
     voxels, occupied = planes.occupancy, planes.occupancy.occupied.clone()
     if not planes.has_kernels(planes.maps):

@@ -56,7 +56,7 @@ class ImagePlanes:
         Args:
             images: (view, channel, height, width), any number of channels; 8-bit ones are divided by 255. Three
                 channels in [0, 1] that need no gradient may be read from a copy packed into 32 bits a pixel, exact for
-                8-bit images and within 1/2046 for others. NumPy arrays, inference tensors and what is not contiguous
+                8-bit images and within 1/2046 for others. NumPy arrays, inference tensors and non-contiguous tensors
                 are copied, so that changes in place do not reach the planes.
             cameras: one an image, of the images' size.
             background: colour of points outside an image.
@@ -74,7 +74,7 @@ class ImagePlanes:
             raise ValueError(
                 f"images: expected the cameras' size {camera.image_size(cameras)}, got {tuple(images.shape[2:])}"
             )
-        self.images = _counting(images.contiguous(), given)  # as kernels read them
+        self.images = _counting(images.contiguous(), given)  # as the kernels need
         self.cameras = cameras
         self.background = background
         self.backend = backend
@@ -94,10 +94,10 @@ class ImagePlanes:
         return show_views(repr(self), self.images, self.cameras)
 
     def mask_views(self, views: Selection) -> ImagePlanes:
-        """The same planes, some more of which show no point: their colours are the background, and nothing is valid.
+        """The same planes with more views masked: no point is valid in them, and their colour is the background.
 
         Args:
-            views: their indices, or whether each of all views is masked.
+            views: indices of the views to mask, or a boolean for each view.
         """
         chosen = as_selection(views, len(self), "views")
         result = copy.copy(self)
@@ -107,7 +107,7 @@ class ImagePlanes:
         return result
 
     def with_images(self, images: ArrayLike) -> ImagePlanes:
-        """Other images of the same cameras, which are looked up exactly; no view of them is masked.
+        """The same cameras with other images, looked up exactly; no view is masked.
 
         Args:
             images: of the same number and size, with any number of channels, as the class takes them.
@@ -115,12 +115,12 @@ class ImagePlanes:
         Raises:
             ValueError: images of another number or size.
         """
-        images = as_images(images)
+        given, images = images, as_images(images)
         if (len(images), *images.shape[2:]) != (len(self), *self.images.shape[2:]):
             expected = f"({len(self)}, channel, {self.images.shape[2]}, {self.images.shape[3]})"
             raise ValueError(f"images: expected shape {expected}, got {tuple(images.shape)}")
         result = copy.copy(self)
-        result.images, result.exact, result.masked = images.contiguous(), True, None
+        result.images, result.exact, result.masked = _counting(images.contiguous(), given), True, None
         vars(result).pop("_kept_packed", None)
         return result
 
@@ -184,9 +184,9 @@ class ImagePlanes:
         return Lookup(torch.where(valid[..., None], colours, self.background), coordinates, valid)
 
     def packed_images(self, points: Tensor) -> PackedImages | None:
-        """The images in 32 bits a pixel, for points that may be looked up in them; None elsewhere.
+        """The images in 32 bits a pixel, for points that may be looked up in them; None otherwise.
 
-        They are made at the first lookup that can use them, and again after the images were changed.
+        Packed at the first lookup that can use them, and again after the images have changed.
         """
         if self.exact or self.images.requires_grad or self.images.device.type != "cpu" or points.dtype != torch.float32:
             return None
@@ -196,11 +196,11 @@ class ImagePlanes:
 
 
 def _counting(images: Tensor, given: ArrayLike) -> Tensor:
-    """Images whose changes in place are counted, so that what is packed of them can be packed again: a copy if needed.
+    """Images whose changes in place PyTorch counts, so that they are packed again after one: a copy where needed.
 
     Args:
-        images: that a caller's became.
-        given: the caller's.
+        images: made of the caller's.
+        given: the caller's images.
     """
     shared = isinstance(given, np.ndarray) and np.may_share_memory(images.numpy(), given)
     if not (shared or images.is_inference()):

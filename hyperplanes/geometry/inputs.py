@@ -1,4 +1,4 @@
-"""What callers give as points and images, made into tensors that every backend takes, or refused in one sentence."""
+"""Points, images and indices from callers: converted to tensors that every backend takes, or refused in one line."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ __all__ = [
 ]
 
 MOST_COLOURS = 4
-"""Channels of an 8-bit picture at most: red, green, blue and alpha."""
+"""Most channels of an 8-bit picture: red, green, blue and alpha."""
 
 ArrayLike: TypeAlias = Tensor | npt.NDArray[Any]
 """A tensor, or a NumPy array of the same shape."""
 
 
 Selection: TypeAlias = slice | Sequence[int] | ArrayLike
-"""Which of several: their indices, or a boolean for each."""
+"""A selection of several items: a slice, indices, or a boolean for each."""
 
 
 def as_tensor(name: str, value: ArrayLike) -> Tensor:
@@ -55,16 +55,16 @@ def as_tensor(name: str, value: ArrayLike) -> Tensor:
 
 
 def check_precision(dtype: torch.dtype | None) -> None:
-    """Refuse a type of whole numbers, or of booleans, for what lies between them.
+    """Refuse integer and boolean types for real values.
 
     Args:
-        dtype: asked for; None where it stays.
+        dtype: the type asked for, or None to keep the present one.
 
     Raises:
-        ValueError: such a type.
+        ValueError: an integer or boolean type.
     """
     if dtype is not None and not dtype.is_floating_point:
-        raise ValueError(f"dtype: expected one of floating-point numbers, got {dtype}")
+        raise ValueError(f"dtype: expected a floating-point type, got {dtype}")
 
 
 def _floating(value: Tensor) -> Tensor:
@@ -72,10 +72,10 @@ def _floating(value: Tensor) -> Tensor:
 
 
 def as_points(points: ArrayLike) -> Tensor:
-    """Points (point, 3) in a floating-point type; whole numbers take PyTorch's default one.
+    """Points (point, 3) in a floating-point type; integers become PyTorch's default one.
 
     Raises:
-        ValueError: another shape, or no numbers.
+        ValueError: another shape, or not numbers.
 
     >>> as_points(np.array([[1, 2, 3]])).dtype
     torch.float32
@@ -91,7 +91,7 @@ def as_matrices(matrices: ArrayLike, views: int) -> Tensor:
     """Projection matrices (view, 3, 4), one a plane.
 
     Raises:
-        ValueError: another shape, or no numbers.
+        ValueError: another shape, or not numbers.
     """
     matrices = as_tensor("matrices", matrices)
     if matrices.shape != (views, 3, 4):
@@ -130,11 +130,11 @@ def as_images(images: ArrayLike, name: str = "images", size: tuple[int, int] | N
 
 
 def check_channels_first(name: str, images: Tensor, size: tuple[int, int] | None = None, axes: str = "permute") -> None:
-    """Check the order of the dimensions of images: that of PyTorch, (N, C, H, W), whatever their numbers are.
+    """Check that images have PyTorch's order of dimensions, (N, C, H, W).
 
-    Dimensions are told by their place, as PyTorch does, never guessed from how small they are. What says that the
-    channels come last is the size of the cameras, where it is that of the second and third dimension and not of the
-    last two; without cameras, 8-bit images of more than four channels, which are no pictures.
+    As in PyTorch, position alone says which dimension is which; sizes are not guessed from. Channels come last where
+    the cameras' size is that of the second and third dimension and not of the last two; without cameras, where 8-bit
+    images would have more than four channels, but no more than four in the last dimension.
 
     Args:
         name: of the argument, for messages.
@@ -163,10 +163,10 @@ def check_channels_first(name: str, images: Tensor, size: tuple[int, int] | None
 
 
 def as_indices(views: ArrayLike, points: Tensor) -> Tensor:
-    """Indices of planes (point, chosen), on the points' device; `check_indices` looks at their values.
+    """Indices of planes (point, chosen), on the points' device; `check_indices` checks their values.
 
     Raises:
-        ValueError: another shape, or no whole numbers.
+        ValueError: another shape, or not integers.
     """
     views = as_tensor("views", views)
     if views.is_floating_point() or views.dtype == torch.bool:
@@ -177,11 +177,11 @@ def as_indices(views: ArrayLike, points: Tensor) -> Tensor:
 
 
 def as_selection(index: Selection, count: int, name: str) -> slice | Tensor:
-    """Which of so many are meant by a slice, by indices, or by whether each is.
+    """A selection as a slice or as indices.
 
     Args:
-        index: indices from -count to count - 1, or one boolean each.
-        count: how many there are.
+        index: a slice, indices from -count to count - 1, or a boolean for each item.
+        count: number of items.
         name: of the argument, for messages.
 
     Returns:
@@ -210,7 +210,7 @@ def as_selection(index: Selection, count: int, name: str) -> slice | Tensor:
     if len(chosen) and (chosen.is_floating_point() or chosen.is_complex()):
         raise ValueError(f"{expected}, got {kind_of(chosen)}")
     chosen = chosen.long()
-    if chosen.device.type == "cpu":  # elsewhere it would be waited for
+    if chosen.device.type == "cpu":  # elsewhere it would synchronise
         check_indices(chosen, count, name, name, from_end=True)
     return chosen
 
@@ -218,19 +218,19 @@ def as_selection(index: Selection, count: int, name: str) -> slice | Tensor:
 def check_indices(
     values: Tensor, count: int, name: str = "views", what: str = "planes", *, from_end: bool = False
 ) -> None:
-    """Check that all are indices of so many; under `torch.compile` and `torch.func` values cannot be looked at.
+    """Check that indices are in range; skipped under `torch.compile` and `torch.func`, where values cannot be read.
 
     Called once a lookup, right before indexing: one pass over the indices is up to 2 % of its time.
 
     Args:
         values: the indices.
-        count: of what they are of.
+        count: number of items.
         name: of the argument, for the message.
-        what: they are of, for the message.
-        from_end: negative ones count from the end.
+        what: name of the items, for the message.
+        from_end: allow negative indices, which count from the end.
 
     Raises:
-        ValueError: the index of none.
+        ValueError: an index out of range.
     """
     if not torch.compiler.is_compiling() and not torch._C._are_functorch_transforms_active() and values.numel():
         least, most = (int(value) for value in torch.aminmax(values))

@@ -106,8 +106,8 @@ def lookup(
     """Projects every point onto planes and interpolates the colours there.
 
     Differentiable in points, matrices and images, any number of times: a gradient with `create_graph=True` is computed
-    in plain PyTorch, as is all that happens under forward-mode differentiation and the transforms of `torch.func`,
-    which the kernels do not know. With u = M (x, 1), the pixel is (u_0 / u_2, u_1 / u_2) in integer pixel centres.
+    in plain PyTorch, as is everything under forward-mode differentiation and the transforms of `torch.func`, which the
+    kernels do not support. With u = M (x, 1), the pixel is (u_0 / u_2, u_1 / u_2) in integer pixel centres.
 
     Args:
         points: (point, 3) in the world; float32 or float64 for the fast backends. All computations happen in their
@@ -127,7 +127,7 @@ def lookup(
 
     Raises:
         ValueError: tensors of other shapes or types, an unknown backend, one that is not available or cannot do what
-            is asked, or an index in `views` of no plane.
+            is asked, or an index in `views` that is out of range.
 
     >>> ramp = torch.arange(4.0).expand(1, 1, 4, 4)
     >>> matrix = torch.tensor([[[2.0, 0.0, 1.5, 0.0], [0.0, 2.0, 1.5, 0.0], [0.0, 0.0, 1.0, 0.0]]])
@@ -166,11 +166,11 @@ def sample(
     packed: PackedImages | None = None,
     backend: str | None = None,
 ) -> Float[Tensor, "point view channel"]:
-    """Bilinear colours of every image at its own coordinates, interpolated as by the lookup.
+    """Bilinear colours of every image at its own coordinates, interpolated as in `lookup`.
 
     Coordinates are those of `Lookup.coordinates`, Kornia's `normalize_pixel_coordinates` and `grid_sample` with
-    `align_corners=True`: (column, row), -1 in the first pixel's centre, 1 in the last one's; along an axis of one pixel
-    all are that pixel. Outside of [-1, 1], and for NaN, the colour is the background, without gradient; unlike in
+    `align_corners=True`: (column, row), -1 at the first pixel's centre, 1 at the last one's; along an axis of one pixel
+    all mean that pixel. Outside of [-1, 1], and for NaN, the colour is the background, without gradient; unlike in
     `grid_sample` nothing is blended with it. Differentiable in images and coordinates, as `lookup` is.
 
     Args:

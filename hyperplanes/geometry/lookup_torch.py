@@ -11,7 +11,7 @@ from hyperplanes.utilities.transforms import transform_of
 __all__ = ["BORDER", "MIN_Z", "interpolate", "lookup", "place", "project", "sample"]
 
 MIN_Z = 1e-4  # z in the camera's frame, in units of the scene's scale; points below it count as behind the camera
-BORDER = 0.01  # pixels by which a point may miss the centres of the outermost pixels, since projections are rounded
+BORDER = 0.01  # pixels beyond the centres of the outermost pixels that still count as inside: projections are rounded
 
 
 def project(points: Tensor, matrices: Tensor, views: Tensor | None, nearest: float = MIN_Z) -> tuple[Tensor, Tensor]:
@@ -38,7 +38,7 @@ def place(pixels: Tensor, front: Tensor, height: int, width: int) -> tuple[Tenso
 
 def interpolate(images: Tensor, coordinates: Tensor, views: Tensor | None) -> Tensor:
     """Bilinear colours (point, view, channel) at coordinates in [-1, 1] from pixel centre to pixel centre."""
-    if views is None and transform_of(images, coordinates):  # which grid_sample does not know
+    if views is None and transform_of(images, coordinates):  # not supported by grid_sample
         views = torch.arange(len(images), device=images.device)[None]
     if views is None:
         grid = coordinates.transpose(0, 1)[:, :, None]

@@ -15,21 +15,21 @@ from hyperplanes.geometry.reflections import Plane
 
 __all__ = ["more_symmetric_plane", "most_symmetric_plane"]
 
-AZIMUTHS = 45  # of normals that are tried first
+AZIMUTHS = 45  # azimuths of normals that are tried first
 OFFSETS = (-0.04, -0.02, 0.0, 0.02, 0.04)  # of planes from the middle of the voxels, in radii of the scene
-APART = math.radians(20)  # between the azimuths of two planes that are followed up
-FOLLOWED = 2  # of the planes
-COARSE, FINE = 3000, 12000  # points that are reflected, at most
+APART = math.radians(20)  # least angle between the azimuths of refined planes
+FOLLOWED = 2  # planes that are refined
+COARSE, FINE = 3000, 12000  # most points that are reflected
 COARSE_ROUNDS, FINE_ROUNDS = 5, 9  # of the search for better planes around one
-SPAN = 0.01  # radians and radii, of the first steps around a plane that is given
+SPAN = 0.01  # first steps around a given plane, in radians and radii
 
 
 @torch.no_grad()
 def most_symmetric_plane(voxels: Occupancy) -> Plane:
-    """The vertical plane about which the most voxels have an occupied one as their mirror image; y is up.
+    """The vertical plane whose reflection maps the most voxels onto occupied ones; y is up.
 
-    Planes of all azimuths and of some offsets are compared by blocks of 2 x 2 x 2 voxels, and the best ones refined by
-    the voxels at the surface, which a plane that is a fraction of a degree off does not map onto one another.
+    Planes of all azimuths and of some offsets are compared on blocks of 2 x 2 x 2 voxels, and the best ones refined on
+    the surface voxels, which a plane that is off by a fraction of a degree does not map onto each other.
 
     Args:
         voxels: some of them occupied.
@@ -70,7 +70,7 @@ def most_symmetric_plane(voxels: Occupancy) -> Plane:
 
 @torch.no_grad()
 def more_symmetric_plane(voxels: Occupancy, plane: Plane) -> Plane:
-    """A plane near to another one about which voxels are more nearly symmetric, tilted and moved by a little.
+    """A plane near a given one about which the voxels are more symmetric, slightly tilted and shifted.
 
     Args:
         voxels: some of them occupied.
@@ -90,15 +90,15 @@ def more_symmetric_plane(voxels: Occupancy, plane: Plane) -> Plane:
 
 
 def _in_world(plane: Float[Tensor, 4], bounds: Sphere) -> Plane:
-    """A plane of the unit sphere as one of the world."""
+    """A plane in world coordinates, from those of the unit sphere."""
     x, y, z = torch.nn.functional.normalize(plane[:3].double(), dim=0).tolist()
     return Plane.of_sphere(bounds, (x, y, z), float(plane[3]))
 
 
 def _points_of(voxels: Occupancy, count: int) -> Float[Tensor, "point 3"]:
-    """At most so many random points in different voxels, evenly chosen, in the unit sphere.
+    """At most `count` random points in evenly chosen voxels, one a voxel, in the coordinates of the unit sphere.
 
-    Centres of voxels would be mapped onto centres, where interpolation loses nothing, by planes along the axes alone.
+    Voxel centres would favour planes along the axes: these alone map centres onto centres, without interpolation.
     """
     centres = voxels.bounds.normalise(voxels.centres())
     centres = centres[torch.linspace(0, len(centres) - 1, min(count, len(centres))).round().long()]
@@ -126,7 +126,7 @@ def _refined(
     rounds: int,
     mode: str,
 ) -> Float[Tensor, 4]:
-    """The best of planes around one: a pattern search, whose steps are halved where no neighbour is better.
+    """The best plane around a given one, by a pattern search that halves its steps where no neighbour is better.
 
     The steps are a turn of the normal about y, its tilt towards y, in radians, and a shift in radii.
     """
@@ -135,12 +135,12 @@ def _refined(
     around = torch.cartesian_prod(*moves)
     for _ in range(rounds):
         across = torch.linalg.cross(plane[:3], torch.tensor([0.0, 1.0, 0.0]))
-        across = across if float(across.norm()) > 0.1 else torch.tensor([1.0, 0.0, 0.0])  # of a horizontal plane
+        across = across if float(across.norm()) > 0.1 else torch.tensor([1.0, 0.0, 0.0])  # for a horizontal plane
         across = torch.nn.functional.normalize(across, dim=0)
         up = torch.linalg.cross(across, plane[:3])
         shifts = around * steps
         normals = torch.nn.functional.normalize(plane[:3] + shifts[:, :1] * across + shifts[:, 1:2] * up, dim=1)
         near = torch.cat([normals, plane[3] + shifts[:, 2:]], 1)
-        best = int(_overlap(grid, points, near, mode).argmax())  # the first of equals, which is the plane itself
+        best = int(_overlap(grid, points, near, mode).argmax())  # of ties the first: the plane itself
         plane, steps = near[best], steps if best else steps / 2
     return plane

@@ -28,11 +28,11 @@ def show_views(
 
     Args:
         title: a line above them.
-        images: in [0, 1]; of channels beyond the third nothing is shown.
+        images: in [0, 1]; channels beyond the third are not shown, nor are images without channels.
         cameras: one an image.
         bounds: the sphere of the scene, drawn as a circle.
     """
-    shown = "".join(_picture(image) for image in images[:MOST].detach().float().cpu())
+    shown = "".join(_picture(image) for image in images[:MOST].detach().float().cpu() if len(image))
     more = f" and {len(images) - MOST} more" if len(images) > MOST else ""
     return f"<div><code>{escape(title)}</code><br>{_drawn(cameras, bounds or Sphere())}{shown}{more}</div>"
 

@@ -38,7 +38,7 @@ class Occupancy:
         bounds: the sphere inside the cube.
 
     Raises:
-        ValueError: no booleans, or no cube.
+        ValueError: not booleans, or not a cube.
     """
 
     occupied: Bool[Tensor, "side side side"]
@@ -76,9 +76,9 @@ class Occupancy:
 
     @property
     def box(self) -> tuple[float, ...]:
-        """Lower and upper corner, in the world, of the box around all occupied voxels and half a voxel more.
+        """Lower and upper corner, in the world, of the bounding box of the occupied voxels, half a voxel larger.
 
-        What rounding moves across a face is in it. Without any voxels it has no size.
+        The margin is for points that rounding moves across a face. Without occupied voxels the box has no size.
         """
         return kept(self, "box", [self.occupied], self._box)
 
@@ -90,7 +90,7 @@ class Occupancy:
         return tuple(end for side in zip(*corners, strict=True) for end in side)
 
     def surface(self) -> Occupancy:
-        """The occupied voxels with a face at an empty one or at the border of the grid: what every ray enters by."""
+        """The occupied voxels with a face at an empty one or at the border of the grid, where rays enter."""
         padded = pad(self.occupied, (1, 1, 1, 1, 1, 1))
         inner = self.occupied.clone()
         for axis in range(3):
@@ -104,7 +104,7 @@ class Occupancy:
         return kept(self, "surface_centres", [self.occupied], lambda: self.surface().centres())
 
     def with_even_side(self) -> Occupancy:
-        """The same voxels in a grid that blocks of 2 x 2 x 2 fill: of an odd side it is one empty voxel longer."""
+        """The same voxels in a grid that divides into blocks of 2 x 2 x 2: an odd side gets one more empty voxel."""
         side = self.occupied.shape[0]
         if side % 2 == 0:
             return self
@@ -118,7 +118,7 @@ class Occupancy:
 
 
 def dilate(occupied: Bool[Tensor, "x y z"], voxels: int = 1) -> Bool[Tensor, "x y z"]:
-    """The occupied voxels of a box and all that are at most so many voxels away along each axis."""
+    """The occupied voxels, and all that are at most `voxels` away from one along each axis."""
     grown = occupied.clone()
     for axis in voxels * (0, 1, 2):
         before, last = grown.clone(), grown.shape[axis] - 1
@@ -133,7 +133,7 @@ def ranges(occupied: Bool[Tensor, "x y z"]) -> list[tuple[int, int]]:
     >>> ranges(torch.tensor([[[False, True, True, False]]]))
     [(0, 1), (0, 1), (1, 3)]
     """
-    cells = occupied.view(torch.uint8)  # whose maximum takes a fifth of the time of `any`
+    cells = occupied.view(torch.uint8)  # their maximum takes a fifth of the time of `any`
     across = cells.amax(2)
     found = [each.nonzero()[:, 0] for each in (across.amax(1), across.amax(0), cells.amax(0).amax(0))]
     return [(int(each[0]), int(each[-1]) + 1) if len(each) else (0, 0) for each in found]
@@ -167,13 +167,13 @@ def carve(
     votes: int = 1,
     within: Occupancy | None = None,
 ) -> Occupancy:
-    """The visual hull: voxels that no mask rules out, or fewer masks than `votes`.
+    """The visual hull: voxels that fewer than `votes` masks rule out.
 
-    A voxel is cleared where some image contains the whole projection of the voxel's bounding ball and no pixel of the
-    mask is set in the bounding box of that projection. So nothing is cut of what the masks show, however thin,
+    A mask rules a voxel out where its image contains the whole projection of the voxel's bounding ball and no pixel of
+    the mask is set in the bounding box of that projection. So nothing that the masks show is removed, however thin,
     whatever the resolution and wherever the images end, and the result does not depend on the order of the views.
 
-    What a mask does not show is cut: a part thinner than the distance of its samples may set no pixel. With 25 views of
+    What a mask misses is removed: a part thinner than the spacing of its samples may set no pixel. With 25 views of
     64 pixels and nine samples a pixel, 0.04 % of the visible surface of procedural planes (12 of them; 0.16 % of the
     worst) lies outside the hull. Masks dilated by one pixel leave 0.001 %, but their hulls have 1.7 times the voxels,
     and 100 steps of fine-tuning in them cost 1.3 times the processor time and end 0.2 dB lower (3 planes): masks are
@@ -184,14 +184,14 @@ def carve(
         cameras: one a mask, of the masks' size.
         bounds: the region to carve from.
         side: voxels an axis.
-        votes: masks that have to rule a voxel out. More than one leave standing what as many wrong masks less one cut
-            off, and leave of a right hull what only few views see past.
-        within: voxels of the same side and bounds, such as the hull of other views: the result lies in them. It takes
-            less time the fewer they are.
+        votes: number of masks that must rule a voxel out. With more than one, `votes - 1` wrong masks remove nothing,
+            but voxels that only as few views see past stay, too.
+        within: voxels of the same side and bounds to start from, such as the hull of other views; the fewer, the
+            faster.
 
     Raises:
-        ValueError: cameras with lens distortion, masks of another number or size than the cameras, an absurd side, less
-            than one vote, or a grid to carve in of another side, bounds or device.
+        ValueError: cameras with lens distortion, masks of another number or size than the cameras, a side out of
+            range, less than one vote, or `within` of another side, bounds or device.
     """
     masks = as_images(masks, "masks")
     expected = (cameras.batch_size, 1, *(camera.image_size(cameras) if cameras.batch_size else masks.shape[2:]))
@@ -233,19 +233,19 @@ def _carve_torch(masks: Tensor, matrices: Tensor, calibrations: Tensor, given: O
     missing = torch.full_like(kept, votes)
     last = points.new_tensor([tables.shape[2] - 1.5, tables.shape[1] - 1.5])
     for matrix, calibration, table in zip(matrices, calibrations, tables, strict=True):
-        # where the voxels that are left fall into the view, and the boxes around what their balls cover
+        # projections of the remaining voxels, and the boxes around those of their balls
         homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
         z = homogeneous[:, 2]
         front = z > _min_z(given)
         pixels = homogeneous[:, :2] / torch.where(front, z, 1.0)[:, None]
         extent = ball_extent(pixels, z, calibration, given.voxel * math.sqrt(3) / 2) + 0.5
-        # pixels of the mask in each box, from four entries of its summed table
+        # mask pixels in each box, from four entries of the summed-area table
         inside = front & ((pixels - extent >= -0.5) & (pixels + extent <= last)).all(1)
         low, high = pixels[inside] - extent[inside], pixels[inside] + extent[inside]
         (left, top), (right, bottom) = (low + 0.5).long().unbind(1), ((high + 0.5).long() + 1).unbind(1)
         right, bottom = right.clamp_max(table.shape[1] - 1), bottom.clamp_max(table.shape[0] - 1)
         count = table[bottom, right] - table[bottom, left] - table[top, right] + table[top, left]
-        # a box without any is a vote against the voxel
+        # an empty box is a vote against the voxel
         missing[inside.nonzero()[count == 0, 0]] -= 1
         stays = missing > 0
         kept, points, missing = kept[stays], points[stays], missing[stays]

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
-__all__ = ["PackedImages", "pack", "unpack"]
+__all__ = ["PackedImages", "pack"]
 
 
 @dataclass(frozen=True)
@@ -23,22 +23,12 @@ class PackedImages:
     words: Int32[Tensor, "view height width"]
     bits: int
 
-    @property
-    def widths(self) -> tuple[int, int, int]:
-        """Bits of each channel."""
-        return _widths(self.bits)
-
-
-def _widths(bits: int) -> tuple[int, int, int]:
-    return bits, bits, bits if bits == 8 else bits - 1
-
 
 @torch.no_grad()
 def pack(images: Float[Tensor, "view channel height width"]) -> PackedImages | None:
     """The images in the better of the two formats, or None where they cannot be packed.
 
-    Images that were 8-bit files come out exact. All others are off by at most 1/2046, a quarter of the 1/512 that the
-    lookup promises.
+    8-bit images are represented exactly, all others to within 1/2046, a quarter of the 1/512 that the lookup promises.
 
     Args:
         images: any float dtype.
@@ -65,19 +55,7 @@ def _is_eight_bits(image: Tensor) -> bool:
 
 
 def _words(image: Float[Tensor, "channel height width"], bits: int) -> Int32[Tensor, "height width"]:
-    steps = image.new_tensor([(1 << width) - 1 for width in _widths(bits)], dtype=torch.float32)
+    widths = bits, bits, bits if bits == 8 else bits - 1
+    steps = image.new_tensor([(1 << width) - 1 for width in widths], dtype=torch.float32)
     whole = (image.float() * steps[:, None, None]).round().to(torch.int32)
     return whole[0] | (whole[1] << bits) | (whole[2] << 2 * bits)
-
-
-def unpack(packed: PackedImages) -> Float[Tensor, "view 3 height width"]:
-    """The images as float32 in [0, 1].
-
-    >>> unpack(pack(torch.tensor([1.0, 0.2, 0.0]).reshape(1, 3, 1, 1))).flatten().tolist()
-    [1.0, 0.20000000298023224, 0.0]
-    """
-    planes = []
-    for channel, width in enumerate(packed.widths):
-        top = (1 << width) - 1
-        planes.append(((packed.words >> channel * packed.bits) & top).float() / top)
-    return torch.stack(planes, 1)

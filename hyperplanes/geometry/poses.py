@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 Count: TypeAlias = Annotated[int, range(1, 2**24)]
-"""Of cameras."""
+"""A number of cameras."""
 
 
 def opencv_from_opengl(world_from_camera: Float[Tensor, "view 4 4"]) -> Float[Tensor, "view 4 4"]:
@@ -52,7 +52,7 @@ def look_at(
 ) -> Float[Tensor, "view 4 4"]:
     """camera_from_world of cameras at `eyes` that look at `target`, image top towards `up`.
 
-    Where the viewing direction is parallel to `up`, the world's axis after the one nearest to `up` takes its place.
+    Where the viewing direction is parallel to `up`, the world axis after the one nearest to `up` is used instead.
 
     Raises:
         ValueError: an eye at the target, a number that is not finite, or an `up` of length zero.
@@ -70,7 +70,7 @@ def look_at(
     if (distance <= 1e-7 * (eyes.norm(dim=-1, keepdim=True) + aim.norm())).any():
         raise ValueError(f"eyes: expected every eye away from the target {target}, got one at it")
     forward, upward = forward / distance, upward / length
-    # where a camera looks along `up`, another axis stands for it
+    # a camera that looks along `up` uses another axis instead
     axis = int(upward.abs().argmax())
     other = torch.zeros_like(upward)
     other[(axis + 1) % 3] = upward[axis].sign()
@@ -112,7 +112,12 @@ def fibonacci_sphere(views: Count, distance: float, lowest: float = -1.0, highes
 
     Returns:
         (view, 4, 4) poses in the order of a golden-angle spiral from `highest` to `lowest`.
+
+    Raises:
+        ValueError: sines out of order or outside [-1, 1].
     """
+    if not -1 <= lowest <= highest <= 1:
+        raise ValueError(f"lowest, highest: expected -1 <= lowest <= highest <= 1, got {lowest} and {highest}")
     fraction = (torch.arange(views) + 0.5) / views
     height = highest + (lowest - highest) * fraction
     azimuth = torch.arange(views) * (math.pi * (3 - math.sqrt(5)))
@@ -122,7 +127,7 @@ def fibonacci_sphere(views: Count, distance: float, lowest: float = -1.0, highes
 
 @without_autocast
 def outermost_first(directions: Float[Tensor, "direction 3"], count: int) -> list[int]:
-    """As `farthest_first`, from the direction on that is farthest from their mean.
+    """As `farthest_first`, starting with the direction farthest from the mean direction.
 
     Args:
         directions: unit vectors.
@@ -133,23 +138,23 @@ def outermost_first(directions: Float[Tensor, "direction 3"], count: int) -> lis
 
 @without_autocast
 def farthest_first(directions: Float[Tensor, "direction 3"], first: int, count: int) -> list[int]:
-    """Directions as far apart as they can be, one after the other (Gonzalez 1985).
+    """Farthest-point sampling of directions (Gonzalez 1985).
 
     >>> farthest_first(torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]), 0, 2)
     [0, 2]
 
     Args:
         directions: unit vectors.
-        first: index of the one to begin with.
+        first: index of the direction to start with.
         count: how many, at most all.
 
     Returns:
-        Indices: the first, and after it always the one of the largest angle to the nearest of those before, none twice.
+        Indices: `first`, then always the direction of the largest angle to the nearest one before; none twice.
     """
     chosen = [first]
     nearest = directions @ directions[first]
     while len(chosen) < count:
-        nearest[chosen[-1]] = math.inf  # a direction that another one repeats is as near to that as to itself
+        nearest[chosen[-1]] = math.inf  # or it might be chosen again where duplicates are left
         chosen.append(int(nearest.argmin()))
         nearest = torch.maximum(nearest, directions @ directions[chosen[-1]])
     return chosen[:count]

@@ -19,7 +19,7 @@ from hyperplanes.utilities.precision import without_autocast
 __all__ = ["SUBPIXELS", "Rays", "Sphere", "cast", "join_rays", "pixel_grid"]
 
 SUBPIXELS = ((0.0, 0.0), (-0.25, -0.25), (0.25, 0.25))
-"""Places in a pixel, from its centre, whose rays have the mean of its area as their mean, nearly: those of training."""
+"""Subpixel offsets of the rays of a training pixel; their mean colour approximates the pixel's area average."""
 
 
 @checked_fields
@@ -47,8 +47,8 @@ class Sphere:
             )
 
     def normalise(self, points: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point 3"]:
-        """Points with the sphere moved to the unit sphere."""
-        moved = points - points.new_tensor(self.centre) if any(self.centre) else points  # a copy to a GPU is waited for
+        """Points in coordinates in which the sphere is the unit sphere."""
+        moved = points - points.new_tensor(self.centre) if any(self.centre) else points  # a copy to a GPU synchronises
         return moved / self.radius
 
 
@@ -139,7 +139,7 @@ def cast(
         check_indices(view, cameras.batch_size, "view", "cameras")
     pixels = pixels.to(cameras.extrinsics)
     rotation, matrix = camera.camera_from_world(cameras)[:, :3, :3], camera.intrinsics(cameras)
-    if cameras.batch_size != 1:  # of a single camera, the numbers stand for all of its rays
+    if cameras.batch_size != 1:  # those of a single camera broadcast over its rays
         rotation, matrix = (each.contiguous().index_select(0, view) for each in (rotation, matrix))
     shown = None
     if isinstance(cameras, DistortedCamera):
@@ -159,8 +159,8 @@ def cast(
     if near_far != "sphere":
         raise ValueError(f"near_far: expected 'sphere' or 'constant', got {near_far!r}")
     middle = (to_centre * directions).sum(-1)
-    # the squared distance of the ray from the centre, of the vector between them: the difference of the squares of
-    # `to_centre` and `middle` is nothing but rounding where the camera is far away
+    # squared distance of the ray from the centre, by the vector between them: the difference of the squares of
+    # `to_centre` and `middle` would be mere rounding error for a camera far away
     square = bounds.radius**2 - (to_centre - middle[:, None] * directions).square().sum(-1)
     hit = square > 0 if shown is None else (square > 0) & shown
     half = torch.where(hit, torch.where(hit, square, 1.0).sqrt(), 0.0)  # no sqrt at 0: its gradient is infinite

@@ -29,7 +29,7 @@ class Plane:
 
     Attributes:
         normal: of length 1.
-        offset: from the origin along it, in world units.
+        offset: signed distance from the origin along the normal, in world units.
 
     Raises:
         ValueError: a normal of another length.
@@ -47,7 +47,7 @@ class Plane:
 
     @classmethod
     def of_sphere(cls, bounds: Sphere, normal: tuple[float, float, float], offset: float = 0.0) -> Plane:
-        """The plane of this normal, so many radii from the middle of a sphere."""
+        """The plane with this normal, `offset` radii from the centre of a sphere."""
         through = sum(a * b for a, b in zip(normal, bounds.centre, strict=True))
         return cls(normal, through + offset * bounds.radius)
 
@@ -65,7 +65,7 @@ class Plane:
         return result
 
     def moved(self, motion: Float[Tensor, "4 4"]) -> Plane:
-        """The plane after a rigid motion of the world, in float64."""
+        """The plane moved together with the world by a rigid motion (a float64 matrix)."""
         normal = motion[:3, :3] @ torch.tensor(self.normal, dtype=torch.float64)
         return Plane(_triple(normal), self.offset + float(normal @ motion[:3, 3]))
 
@@ -73,18 +73,18 @@ class Plane:
 @checked_fields
 @dataclass(frozen=True)
 class Symmetry:
-    """The planes about which an object is its own mirror image: one, or several through a vertical axis.
+    """The mirror planes of an object: one, or several through a vertical axis.
 
-    Several meet at equal angles. About their axis the object then is its own image after a rotation by 360° / order,
-    too (the group C_nv of Schoenflies' notation).
+    Several planes meet at equal angles. The object is then also symmetric under rotation by 360° / order about their
+    axis (the group C_nv in Schoenflies notation).
 
     Attributes:
         plane: one of the planes.
-        order: how many there are, at most MOST_PLANES.
-        axis: a point of their axis; y is up.
+        order: number of planes, at most MOST_PLANES.
+        axis: a point on their axis; y is up.
 
     Raises:
-        ValueError: no plane or too many, or several through one that is not vertical or that the axis does not lie in.
+        ValueError: no plane or too many, or several where `plane` is not vertical or does not contain the axis.
     """
 
     plane: Plane
@@ -99,16 +99,16 @@ class Symmetry:
 
     @property
     def images(self) -> int:
-        """How many images of the object, itself among them, are the same: 2 a plane."""
+        """Number of symmetric images of the object, including itself: 2 a plane."""
         return 2 * self.order
 
     @property
     def rotations(self) -> list[Float[Tensor, "4 4"]]:
-        """The rotations of the world after which the object is the same, in float64; the first one is none."""
+        """The rotations that map the object onto itself, in float64; the first is the identity."""
         return [rotation_about(self.axis, 2 * math.pi * index / self.order) for index in range(self.order)]
 
     def moved(self, motion: Float[Tensor, "4 4"]) -> Symmetry:
-        """The symmetry of the object after a rigid motion, in float64; of several planes one about a vertical axis."""
+        """The symmetry moved with the object by a rigid motion (float64), which keeps an axis of planes vertical."""
         axis = motion[:3, :3] @ torch.tensor(self.axis, dtype=torch.float64) + motion[:3, 3]
         return Symmetry(self.plane.moved(motion), self.order, _triple(axis))
 
@@ -117,8 +117,8 @@ def rotation_about(point: tuple[float, float, float], angle: float) -> Float[Ten
     """The rotation of the world about the vertical axis through a point, in float64.
 
     Args:
-        point: of the axis.
-        angle: in radians; by a quarter turn the z axis is mapped onto the x axis.
+        point: on the axis.
+        angle: in radians; a quarter turn maps the z axis onto the x axis.
     """
     x, _, z = point
     cos, sin = math.cos(angle), math.sin(angle)
@@ -128,17 +128,17 @@ def rotation_about(point: tuple[float, float, float], angle: float) -> Float[Ten
 
 @checked
 def reflected_cameras(cameras: PinholeCamera, plane: Plane) -> PinholeCamera:
-    """The cameras to which flipped pictures belong, once the world is reflected about a plane.
+    """The cameras of horizontally flipped pictures in a world that is reflected about a plane.
 
-    What a camera shows of a point in column u is shown by the reflected one of the point's mirror image in column
-    W - 1 - u. So the same picture, flipped, is a view of the mirror image of the object.
+    Where a camera shows a point in column u, the reflected camera shows the point's mirror image in column W - 1 - u:
+    the flipped picture is a view of the mirrored object.
 
     Args:
         cameras: with or without lens distortion.
         plane: of the reflection.
     """
     pose, (height, width) = camera.camera_from_world(cameras), camera.image_size(cameras)
-    # a reflection of the world and one of the camera's x axis make a rotation again
+    # a reflection of the world and one of the camera's x axis compose to a rotation
     flip = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=torch.float64))
     moved = (flip @ pose.cpu().double() @ plane.reflection).to(pose)
     matrix = camera.intrinsics(cameras).clone()

@@ -1,4 +1,4 @@
-"""ImagePlanes that also say which of them see a point: by their borders, masks and the depth of the visual hull."""
+"""ImagePlanes that also say which views see a point, by image borders, masks and the depth of the visual hull."""
 
 from __future__ import annotations
 
@@ -49,17 +49,17 @@ from hyperplanes.utilities.transforms import (
 
 __all__ = ["VisibilityPlanes", "choose_torch"]
 
-POINTS = 512  # that one call of the kernel works on
+POINTS = 512  # per kernel call
 
 
 class VisibilityPlanes:
     """ImagePlanes with the masks and the depth of the visual hull beside the colours.
 
     A view's penalty at a point is how far the point lies behind the first surface that it sees, in radii of the scene
-    beyond the `tolerance` and at most DEEPEST; PARTLY more where its mask is not whole, so that background is mixed
-    into the colour; and UNSEEN where the point is not in the picture. Where a border of a picture cuts the object, the
-    penalty rises over a MARGIN towards it, so that the view has no weight left where the picture ends: a seam would be
-    seen between pictures of different exposure (Buehler et al. 2001, "Unstructured Lumigraph Rendering").
+    beyond the `tolerance` and at most DEEPEST; PARTLY more where its mask is not opaque, so that background is mixed
+    into the colour; and UNSEEN where the point is not in the picture. Where a border of a picture crops the object, the
+    penalty rises over a MARGIN towards it, so that the view has no weight left where the picture ends: otherwise seams
+    would show between pictures of different exposure (Buehler et al. 2001, "Unstructured Lumigraph Rendering").
 
     Args:
         images: (view, 3, height, width), RGB in [0, 1].
@@ -97,19 +97,19 @@ class VisibilityPlanes:
 
     @property
     def maps(self) -> Float[Tensor, "view height width 2"]:
-        """As `depth_opacity` for those who read opacities alone: depths may not have been computed yet."""
+        """As `depth_opacity`, for callers that read opacities alone: the depths may not have been computed yet."""
         return self._maps.values
 
     @property
     def tolerance(self) -> float:
-        """The side of a voxel in radii of the scene: what depths are exact to."""
+        """The side of a voxel in radii of the scene, to which depths are exact."""
         return 2 / self.occupancy.occupied.shape[0]
 
     def mask_views(self, views: Selection) -> VisibilityPlanes:
-        """The same planes, some more of which see nothing: no point is valid there, and its colour is the background.
+        """The same planes with more views masked: no point is valid in them, and their colour is the background.
 
         Args:
-            views: their indices, or whether each of all views is masked.
+            views: indices of the views to mask, or a boolean for each view.
         """
         result = copy.copy(self)
         result.colours = self.colours.mask_views(views)
@@ -119,12 +119,12 @@ class VisibilityPlanes:
         """The same planes with other penalties of the views.
 
         Args:
-            penalties: what counts against a view, and how much.
+            penalties: the costs of depth and of masks.
         """
         return self._with(penalties=penalties)
 
     def with_handicaps(self, handicaps: Float[Tensor, " view"]) -> VisibilityPlanes:
-        """The same planes, whose views have other penalties beside those of points.
+        """The same planes with handicaps of the views.
 
         Args:
             handicaps: added to the penalty of each view wherever it shows a point.
@@ -132,16 +132,16 @@ class VisibilityPlanes:
         return self._with(handicaps=handicaps.to(self._against.handicaps))
 
     def _with(self, **changes: Any) -> VisibilityPlanes:
-        """The same planes, against whose views something else counts."""
+        """The same planes with other view penalties."""
         result = copy.copy(self)
         result._against = replace(self._against, **changes)
         return result
 
     def with_surface(self, voxels: Occupancy) -> VisibilityPlanes:
-        """The same planes, of which those nearest to a direction are judged by another surface than the hull's.
+        """The same planes, whose views nearest to a direction are chosen by another surface than the hull's.
 
         Args:
-            voxels: within the hull; a pixel whose ray meets none of them sees all that lies along it.
+            voxels: within the hull; a pixel whose ray meets none of them sees every point along it.
         """
         result = copy.copy(self)
         opacity = self.maps[..., 1]
@@ -163,12 +163,12 @@ class VisibilityPlanes:
         Args:
             points: in the world.
             directions: unit vectors along which the points are seen; without them there are no nearest views.
-            best: how many views of the least penalty, at most all; 0 where only the others are wanted.
-            nearest: how many views of the least sum of the angle between the direction and theirs, in radians, and
-                ANGLE times their penalty, where that is positive. One more is returned, where there is one.
+            best: number of views of least penalty, at most all; 0 where only the nearest are wanted.
+            nearest: number of views with the least sum of their angle to the direction, in radians, and ANGLE times
+                their penalty where it is positive. One more is returned where there is one.
 
         Returns:
-            The views. All of them are looked at; colours are looked up by who wants them.
+            The views, chosen from all of them; their colours are not looked up.
         """
         best, nearest = min(best, len(self)), min(nearest + 1, len(self)) if directions is not None else 0
         choose = self._choose_compiled if self.has_kernels(points) else partial(choose_torch, self)
@@ -189,13 +189,13 @@ class VisibilityPlanes:
         return kind and bool(find_spec("numba")) and not isinstance(self.colours.cameras, DistortedCamera)
 
     def _limits(self) -> list[float]:
-        """The numbers by which the kernels judge."""
+        """The parameters of the kernels."""
         per_radius, own = 1 / self.occupancy.bounds.radius, self._against.penalties
         limits = [self.colours.nearest, per_radius, self.tolerance, own.deepest, own.partly, WHOLE, UNSEEN, ANGLE]
         return [*limits, own.steep, own.highest, own.least, 1 / margin(*self.maps.shape[1:3]), CUT, BEYOND]
 
     def shown_cameras(self) -> Tensor:
-        """What the kernels read of each view: centre, projection matrix, 0 where hidden, its handicap and margins."""
+        """What the kernels read of each view: centre, projection matrix, 0 where masked, handicap and margins."""
         against, masked, cameras = self._against, self.colours.masked, self.colours.cameras
         poses = kept(self, "poses", [cameras.extrinsics, cameras.intrinsics], self._poses)
         shown = poses.new_ones(len(self)) if masked is None else (~masked).to(poses)
@@ -232,7 +232,7 @@ class VisibilityPlanes:
 
         Args:
             points: in the world.
-            directions: along which they are seen, where there are any.
+            directions: along which the points are seen, if any.
         """
         if type(self) is not VisibilityPlanes or not self._takes_kernels(points):
             return False
@@ -250,15 +250,15 @@ class VisibilityPlanes:
         bounds: Sphere,
         grid: Float[Tensor, "channel x y z"] | None = None,
     ) -> Described:
-        """What a network reads of points, by one kernel; `can_describe` says where. Without gradients.
+        """What a network reads of points, by one kernel (see `can_describe`); without gradients.
 
         Args:
             points: in the world.
             directions: unit vectors along which the points are seen; without them nothing is blended.
             reading: how many views, and how they are encoded.
             bounds: the sphere that the network sees as the unit sphere.
-            grid: features over the scene, which are written into the same rows, the first through a sigmoid; in any
-                layout, without a copy where the numbers of a cell are side by side.
+            grid: features over the scene, appended to the rows, the first one through a sigmoid; copied unless the
+                features of a cell are adjacent in memory.
         """
         count, views = len(points), self.maps.shape[:3]
         packed = self.colours.packed_images(points)
@@ -290,15 +290,15 @@ class VisibilityPlanes:
 def choose_torch(
     planes: VisibilityPlanes, points: Tensor, directions: Tensor | None, best: int, nearest: int, depth_opacity: Tensor
 ) -> Visibility:
-    """As `VisibilityPlanes.choose`, in plain PyTorch, by given depths and opacities.
+    """`VisibilityPlanes.choose` in plain PyTorch, for given depths and opacities.
 
     Args:
         planes: the views.
         points: in the world.
-        directions: along which they are seen, or None.
-        best: how many views.
-        nearest: likewise.
-        depth_opacity: by which views are judged.
+        directions: along which the points are seen, or None.
+        best: as in `choose`.
+        nearest: number of views nearest to the direction.
+        depth_opacity: depth and opacity of each pixel.
     """
     # depth and opacity of every view where the point falls: (point, view)
     maps = planes.colours.with_images(depth_opacity.permute(0, 3, 1, 2))
@@ -309,7 +309,7 @@ def choose_torch(
     valid = found.valid if planes.colours.masked is None else found.valid & ~planes.colours.masked
     depth, coverage = found.colours.unbind(-1)
     coverage = torch.where(valid, coverage, 1.0)
-    # how far behind the surface, in radii, and what that and a broken mask cost
+    # depth behind the surface, in radii, and the penalty of each view
     behind = torch.where(valid, (distances - depth) / planes.occupancy.bounds.radius, 0.0)
     penalty = planes._against.penalty(behind - planes.tolerance, coverage, found.coordinates, depth_opacity.shape[1:3])
     penalty = torch.where(valid, penalty, UNSEEN)
@@ -329,12 +329,12 @@ def choose_torch(
 
 
 class _Maps:
-    """Depth and opacity of the pixels of planes and of all their copies.
+    """Depth and opacity of each pixel, shared by planes and all their copies.
 
     Args:
-        opacity: of the masks.
+        opacity: opacity of the masks.
         cameras: of the views.
-        occupancy: whose first voxel along a ray gives the depth.
+        occupancy: grid whose first voxel along a ray gives the depth.
     """
 
     def __init__(
@@ -351,14 +351,14 @@ class _Maps:
 
     @property
     def opacity(self) -> Float[Tensor, "view height width"]:
-        """Of the masks."""
+        """Opacity of the masks."""
         return self._values[..., 1]
 
     @property
     def complete(self) -> Float[Tensor, "view height width 2"]:
         """The values with their depths, which are computed once.
 
-        To function transforms they are constants, but where a transform made the tensors, which end with it.
+        They are constants under function transforms, but computed anew where a transform made the tensors.
         """
         if self._complete:
             return self._values

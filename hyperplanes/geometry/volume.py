@@ -1,4 +1,4 @@
-"""What all views show, as a coarse grid over the scene: the same for any number of views in any order."""
+"""A coarse feature grid of all views over the scene, whose shape does not depend on their number or order."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from hyperplanes.geometry.visibility import VisibilityPlanes
 __all__ = ["CHANNELS", "SIDE", "interpolate_grid", "resampled_grid", "volume_of"]
 
 SIDE = 32  # cells an axis
-CHANNELS = 5  # of a cell: occupied share, mean colour, number of views
-BEST = 8  # views of a cell that count
+CHANNELS = 5  # per cell: occupied share, mean colour, number of views
+BEST = 8  # views averaged per cell
 _READING = Reading(BEST, nearest=0, point_frequencies=0, direction_frequencies=0, falloff=0.0)
 
 
 @torch.no_grad()
 def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
-    """What the views show of each cell of a grid over the scene; zero in cells outside the visual hull.
+    """Features of each cell of a grid over the scene, from all views; zero in cells outside the visual hull.
 
     Args:
         planes: of one object.
 
     Returns:
-        Five channels: the share of the cell that the hull occupies; the mean of the colours, in [-1, 1], that the views
-        which see the cell best show at its centre; and the logarithm of the number of views that show it. The variance
-        of these colours and the penalty of the best view brought nothing (docs/image-based.md).
+        Five channels: the share of the cell inside the hull; the mean colour, in [-1, 1], at its centre in the views
+        that see it best; and the logarithm of the number of views that show it. Adding the variance of these colours or
+        the penalty of the best view did not help (docs/image-based.md).
     """
     occupancy = planes.occupancy
-    # which share of each cell is within the hull (x, y, z), and the centres of cells that have some
+    # the share of each cell inside the hull (x, y, z), and the centres of cells where it is not zero
     share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.maps), SIDE)[0, 0]
     cells = (share > 0).nonzero()
     unit = (cells.to(share) + 0.5) * (2 / SIDE) - 1
@@ -62,7 +62,7 @@ def interpolate_grid(
     """Trilinear interpolation of values at the centres of the cells of a grid over the cube around a sphere.
 
     Args:
-        grid: values; the outermost ones hold up to the border and beyond.
+        grid: values; beyond the outermost centres they are constant.
         points: in the world.
         bounds: the sphere.
     """
@@ -71,10 +71,10 @@ def interpolate_grid(
 
 
 def resampled_grid(grid: Float[Tensor, "channel x y z"], side: int) -> Float[Tensor, "channel side side side"]:
-    """The values of a grid at the centres of other cells over the same cube, by trilinear interpolation.
+    """A grid resampled to another number of cells over the same cube, by trilinear interpolation.
 
     Args:
         grid: as in `interpolate_grid`.
-        side: cells an axis of the other one.
+        side: new number of cells an axis.
     """
     return interpolate(grid[None], (side,) * 3, mode="trilinear", align_corners=False)[0]

@@ -1,1 +1,1 @@
-"""What every room uses: files, settings, entry points, error messages, formatting, metrics, a cache."""
+"""Helpers shared by all packages: files, settings, entry points, error messages, formatting, metrics, a cache."""

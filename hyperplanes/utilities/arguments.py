@@ -1,4 +1,4 @@
-"""Arguments of public functions that are of another type than their annotation says: one line, where they enter."""
+"""One-line errors for arguments of public functions whose type differs from the annotation."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ R = TypeVar("R")
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """A decorator: arguments of another class than annotated are a ValueError that names the argument.
+    """A decorator: an argument of another type than annotated raises a ValueError that names it.
 
-    Looked at are annotations that are classes, generic ones such as `Sequence[str]`, of which the class counts, tuples
-    with their elements, `Callable`, `Literal`, `Annotated[int, range(...)]`, unions of all these, and jaxtyping's
-    arrays, of which the kind of numbers, the number of dimensions and those of a fixed size count; all others are taken
-    as they come. A class is no `Callable` that returns something else than its instances.
+    It checks annotations that are classes, generics such as `Sequence[str]` (the class alone), tuples with their
+    elements, `Callable`, `Literal`, `Annotated[int, range(...)]`, unions of these, and jaxtyping's arrays (kind of
+    numbers, number of dimensions and fixed sizes); it ignores all others. A class passes for a `Callable` only if its
+    instances are of the returned type.
 
     Args:
-        function: with annotations that its module can resolve.
+        function: its annotations must be resolvable in its module.
     """
     return _checking(function, function)
 
 
 def checked_fields(settings: type[R]) -> type[R]:
-    """A decorator of a dataclass, whose fields are checked as the arguments of a function are.
+    """A decorator for dataclasses that checks fields as `checked` checks arguments.
 
     >>> from dataclasses import dataclass
     >>> @checked_fields
@@ -62,7 +62,7 @@ def checked_fields(settings: type[R]) -> type[R]:
 
 
 def _checking(function: Callable[P, R], annotated: Any) -> Callable[P, R]:
-    """A function that looks at its arguments first, by the annotations of itself or of a class."""
+    """The function with its arguments checked first, by its own annotations or those of a class."""
     signature = inspect.signature(function)
     names = list(signature.parameters)
     several = any("VAR" in each.kind.name for each in signature.parameters.values())
@@ -76,7 +76,7 @@ def _checking(function: Callable[P, R], annotated: Any) -> Callable[P, R]:
     def called(*positional: P.args, **named: P.kwargs) -> R:
         if several:
             given = signature.bind(*positional, **named).arguments
-        else:  # the same in a fraction of the time
+        else:  # the same, much faster
             given = dict(zip(names, positional, strict=False)) | named
         looked_at = hints()
         for name, value in given.items():
@@ -89,7 +89,7 @@ def _checking(function: Callable[P, R], annotated: Any) -> Callable[P, R]:
 
 
 def mismatch(value: object, hint: Any) -> str | None:
-    """What is expected and what there is where a value is of another type than an annotation says; None where it fits.
+    """What was expected and found if a value does not have the type of an annotation; None if it does.
 
     >>> mismatch((3, "4"), tuple[int, ...])
     "expected a tuple of int, got a tuple of 3, '4'"
@@ -98,7 +98,7 @@ def mismatch(value: object, hint: Any) -> str | None:
 
 
 def kind_of(value: object) -> str:
-    """What a value is, for a message.
+    """A value's kind, for a message.
 
     >>> kind_of(None), kind_of([1]), kind_of((1.5, [2]))
     ('None', 'a list', 'a tuple of 1.5, a list')
@@ -118,7 +118,7 @@ def _parts(hint: Any) -> tuple[Any, ...]:
     return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
 
 
-_in_any_order = cache(_parts)  # `str | Path` equals `Path | str`: for messages the order as written is kept
+_in_any_order = cache(_parts)  # `str | Path` equals `Path | str`; messages keep the order as written
 
 
 @cache
@@ -133,7 +133,7 @@ def _is_array(hint: Any) -> bool:
 
 @cache
 def _range(hint: Any) -> range | None:
-    """The values of a whole number that is annotated with them."""
+    """The range of an annotated integer, if any."""
     if get_origin(hint) is not Annotated:
         return None
     return next((note for note in get_args(hint)[1:] if isinstance(note, range)), None)
@@ -154,7 +154,7 @@ def _fits(value: object, hint: Any) -> bool:
 
 
 def _is_tensor(value: object) -> TypeGuard[Tensor]:
-    torch = sys.modules.get("torch")  # loading it takes two seconds, and where nobody did, there is no tensor
+    torch = sys.modules.get("torch")  # importing it takes two seconds, and without it there are no tensors
     return torch is not None and isinstance(value, torch.Tensor)
 
 
@@ -188,9 +188,7 @@ def _fits_one(value: object, hint: Any) -> bool:
         number = number and (not isinstance(value, Integral) or abs(int(value)) < 2**63)
         return number or (_is_tensor(value) and value.numel() == 1)
     if hint is int:
-        return (
-            isinstance(value, Integral) and not isinstance(value, bool) and abs(int(value)) < 2**63
-        )  # as tensors hold them
+        return isinstance(value, Integral) and not isinstance(value, bool) and abs(int(value)) < 2**63  # as in tensors
     origin, arguments = _generic(hint)
     if origin is Literal:
         return value in arguments
@@ -204,14 +202,14 @@ def _fits_one(value: object, hint: Any) -> bool:
         return len(value) == len(parts) and all(map(_fits, value, parts))
     try:
         return isinstance(value, origin or hint)
-    except TypeError:  # a protocol that cannot be asked
+    except TypeError:  # a protocol that is not runtime-checkable
         return True
 
 
 def _has_shape(shape: tuple[int, ...], dimensions: tuple[Any, ...]) -> bool:
-    """Whether there are as many dimensions as jaxtyping names, and those that it gives a number are of that size.
+    """Whether a shape has jaxtyping's number of dimensions and its fixed sizes.
 
-    A variadic dimension, of which there is one at most, stands for any number of them.
+    A variadic dimension, at most one, stands for any number of dimensions.
     """
     free = next((at for at, each in enumerate(dimensions) if "Variadic" in type(each).__name__), None)
     if free is not None:

@@ -1,4 +1,4 @@
-"""Poses: OpenCV's camera axes (x right, y down, z forward) and OpenGL's (x right, y up, z backwards), inverses."""
+"""Poses: OpenCV (x right, y down, z forward) and OpenGL camera axes (x right, y up, z backwards), and inverses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["flip_camera_axes", "invert_poses"]
 
 
 def flip_camera_axes(world_from_camera: Any) -> Any:
-    """The same poses (..., 4, 4) in OpenGL's axes where they were in OpenCV's, and the other way round.
+    """Poses (..., 4, 4) converted from OpenCV's camera axes to OpenGL's, or back.
 
     Args:
         world_from_camera: NumPy array or PyTorch tensor; not changed.
@@ -28,7 +28,7 @@ def flip_camera_axes(world_from_camera: Any) -> Any:
 
 
 def invert_poses(poses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """camera_from_world (..., 4, 4) of rigid world_from_camera, and the other way round; no system is solved.
+    """The inverses of rigid transforms (..., 4, 4), in closed form: camera_from_world of world_from_camera, or back.
 
     >>> pose = np.eye(4)
     >>> pose[:3, 3] = 1, 2, 3

@@ -32,7 +32,7 @@ class CheckpointError(files.DataError):
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; DataError where something else is in the file.
+    """Read a JSON object; DataError where the file holds something else.
 
     Raises:
         CheckpointError: no such file.
@@ -64,14 +64,14 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
 
     Args:
         path: a safetensors file.
-        expected: the names and shapes that must be there, no more and no less; anything where absent.
+        expected: tensors of exactly the names and shapes required; anything where absent.
 
     Returns:
         Tensors by name. DataError where there is no regular file.
 
     Raises:
-        CheckpointError: no such file, a damaged one, other names or shapes than expected, tensors that their checksum
-            does not fit (files of other programs have none), or a number that is not finite.
+        CheckpointError: no such file, a damaged one, other names or shapes than expected, tensors that do not match
+            their checksum (files of other programs have none), or a number that is not finite.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -81,7 +81,7 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
     try:
         with safe_open(path, "pt") as file:
             checksum = (file.metadata() or {}).get(CHECKSUM)
-            found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+            found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     except (SafetensorError, OSError, ValueError, TypeError, RuntimeError) as error:
         raise CheckpointError(
             f"{path}: expected whole safetensors, found a damaged file ({error}); copy it again"
@@ -95,11 +95,11 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
         )
     if (name := _not_finite(found)) is not None:
         raise CheckpointError(f"{path}: expected finite numbers, found NaN or infinity in {name}; train or bake again")
-    return {name: value.clone() for name, value in found.items()}  # in memory of its own, as aligned as what was saved
+    return {name: value.clone() for name, value in found.items()}  # own, aligned memory
 
 
 def _checksum(tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 of names, types, shapes and bytes, whatever the order."""
+    """SHA-256 of names, types, shapes and bytes, independent of order."""
     result = hashlib.sha256()
     for name in sorted(tensors):
         value = tensors[name].contiguous()
@@ -115,7 +115,7 @@ def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
 
 
 def check_tensors(path: Path, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    """Compare names and shapes, no more and no less; where the expected tensors are allocated does not matter.
+    """Check that names and shapes are exactly the expected ones, on any device.
 
     Args:
         path: where they were found, for the message.

@@ -1,4 +1,4 @@
-"""sRGB, as images are stored and shown, to linear light, in which it is computed, and back (IEC 61966-2-1)."""
+"""Conversion between sRGB, for storage and display, and linear light, for computation (IEC 61966-2-1)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values as the bytes of files: JSON, PNG, JPEG, PLY, NPZ, each the same for the same value, and their checksum."""
+"""Deterministic encoding of values as JSON, PNG, JPEG, PLY and NPZ files, and checksums."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 __all__ = ["encode_jpeg", "encode_json", "encode_npz", "encode_ply", "encode_png", "sha256"]
 
-_COLOUR_TYPES = {1: 0, 3: 2, 4: 6}  # PNG's numbers, by channels
+_COLOUR_TYPES = {1: 0, 3: 2, 4: 6}  # PNG colour types by number of channels
 
 
 def encode_json(value: Any) -> bytes:
-    r"""JSON with sorted keys, two spaces a level and a final newline: the same value gives the same bytes.
+    r"""JSON with sorted keys, two spaces per level and a final newline: the same value gives the same bytes.
 
     >>> encode_json({"b": 1, "a": [1.5]})
     b'{\n  "a": [\n    1.5\n  ],\n  "b": 1\n}\n'
@@ -28,11 +28,11 @@ def encode_json(value: Any) -> bytes:
 
 
 def encode_jpeg(pixels: npt.NDArray[np.uint8], quality: int) -> bytes:
-    """JPEG bytes of (height, width, 3) pixels, of whose colours none are left out.
+    """JPEG bytes of (height, width, 3) pixels, without chroma subsampling.
 
     Args:
         pixels: the image.
-        quality: as Pillow counts it, to 100.
+        quality: 0 to 100, as in Pillow.
     """
     from PIL import Image
 
@@ -49,7 +49,7 @@ def encode_ply(
     Args:
         points: (point, 3).
         colours: (point, 3), RGB.
-        normals: (point, 3), where there are any.
+        normals: (point, 3), optional.
     """
     numbers = points if normals is None else np.concatenate([points, normals], 1)
     names = ("x", "y", "z", "nx", "ny", "nz")[: numbers.shape[1]]
@@ -70,7 +70,7 @@ def encode_png(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], *, small:
     tries five filters on every row, takes 6.9 kB and 0.54 ms at its fastest level, 6.6 kB and 0.64 ms at this one.
 
     Args:
-        pixels: the image; 16-bit only where it need not be small.
+        pixels: the image; 16 bits only without `small`.
         small: let Pillow search for the smallest file, which pays for photographs and noisy pictures.
 
     Returns:
@@ -87,7 +87,7 @@ def encode_png(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], *, small:
         return buffer.getvalue()
     height, width = pixels.shape[:2]
     rows = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">"), copy=False)).view(np.uint8)
-    lines = np.zeros((height, 1 + rows.size // height), dtype=np.uint8)  # each begins with its filter: 0, none
+    lines = np.zeros((height, 1 + rows.size // height), dtype=np.uint8)  # each begins with its filter type: 0, none
     lines[:, 1:] = rows.reshape(height, -1)
     colour = _COLOUR_TYPES[pixels.shape[2] if pixels.ndim == 3 else 1]
     header = struct.pack(">IIBBBBB", width, height, 8 * pixels.dtype.itemsize, colour, 0, 0, 0)
@@ -116,7 +116,7 @@ def encode_npz(arrays: dict[str, npt.NDArray[Any]]) -> bytes:
 
 
 def sha256(data: bytes) -> str:
-    """The checksum of some bytes, in hexadecimal.
+    """SHA-256 of bytes, in hexadecimal.
 
     >>> sha256(b"")[:8]
     'e3b0c442'

@@ -1,4 +1,4 @@
-"""What other installed packages add: objects that entry points name."""
+"""Plugins: objects that entry points of other installed packages name."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ def load_entries(group: str, own: Collection[str] = ()) -> dict[str, Any]:
 
     Args:
         group: such as "hyperplanes.fields".
-        own: names that are taken; entries of those names are left out.
+        own: reserved names, whose entries are left out.
 
     Returns:
-        What the entry points name; each is imported once. One that cannot be imported is a ValueError that names its
+        The objects by name; each is imported once. One that cannot be imported is a ValueError that names its
         package.
     """
     return {entry.name: _load(entry) for entry in find_entries(group) if entry.name not in own}
 
 
 def find_entries(group: str) -> tuple[EntryPoint, ...]:
-    """The entry points of a group; kept while `sys.path` stays, as the metadata of all packages take 10 ms to read."""
+    """The entry points of a group, cached until `sys.path` changes: reading all packages' metadata takes 10 ms."""
     return _find_entries(group, tuple(sys.path))
 
 

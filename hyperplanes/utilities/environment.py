@@ -1,4 +1,4 @@
-"""What a figure depends on beside the command: the commit, the machine, the versions."""
+"""What a result depends on beside the command: the commit, the machine, the versions."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = [
 ]
 
 ROOT = Path(__file__).resolve().parents[2]
-RESULTS = "benchmarks/results"  # of a checkout
+RESULTS = "benchmarks/results"  # in a checkout
 
 
 def cache_folder() -> Path:
-    """Where programs of this user keep what may be deleted: `$XDG_CACHE_HOME`, `~/.cache`, or a temporary folder.
+    """This user's cache folder: `$XDG_CACHE_HOME`, `~/.cache`, or a temporary folder.
 
-    A user whom the system does not know, as in a container started by number, may have no home.
+    A user without an entry in the system, as in a container started with a numeric user, may have no home.
     """
     if base := os.environ.get("XDG_CACHE_HOME"):
         return Path(base)
@@ -41,7 +41,7 @@ def cache_folder() -> Path:
 def find_commit() -> str:
     """The commit of this code as `git describe --dirty` puts it, or the version of the installed package.
 
-    Files of RESULTS that have changed are not counted: one benchmark writes them after the other.
+    Changed files in RESULTS are ignored: benchmarks write them one after the other.
     """
     from importlib.metadata import PackageNotFoundError, version
 
@@ -53,7 +53,7 @@ def find_commit() -> str:
         if Path(ask("rev-parse", "--show-toplevel") or os.sep).resolve() == ROOT:
             changed = ask("diff", "--name-only", "HEAD", "--", ".", f":(exclude){RESULTS}")
             return (ask("describe", "--always") or "unknown") + ("-dirty" if changed else "")
-    except OSError:  # no git here
+    except OSError:  # no git
         pass
     try:
         return f"version {version('hyperplanes')}"
@@ -62,7 +62,7 @@ def find_commit() -> str:
 
 
 def find_processor() -> str:
-    """The processor in words."""
+    """The name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -73,28 +73,28 @@ def find_processor() -> str:
 
 @functools.cache
 def has_amx() -> bool:
-    """Whether this process may multiply matrices in bfloat16 by Intel's AMX: the CPU can, and Linux lets it."""
+    """Whether the CPU has Intel's AMX for bfloat16, and Linux lets this process use it."""
     return {"amx_bf16", "avx512_bf16"} <= _features() and _allow_tiles()
 
 
 def _features() -> set[str]:
-    """What Linux says of the processor, word by word: its vendor and flags among them."""
+    """Linux' description of the processor as words, such as its vendor and flags."""
     try:
         return set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
-    except OSError:  # no Linux
+    except OSError:  # not Linux
         return set()
 
 
 def _allow_tiles() -> bool:
-    """Ask Linux for the tile registers of AMX, for all threads of this process: those that did not ask have none."""
+    """Ask Linux for the tile registers of AMX for all threads of this process; otherwise there are none."""
     arch_prctl, request, tile_data = 158, 0x1023, 18  # ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
     return ctypes.CDLL(None).syscall(arch_prctl, request, tile_data) == 0
 
 
 def has_bfloat16_products() -> bool:
-    """Whether AVX-512 multiplies numbers of bfloat16 faster than those of single precision.
+    """Whether AVX-512 multiplies bfloat16 faster than single precision.
 
-    That is so on AMD's processors that have such instructions, as far as Linux tells; on Intel's it was not measured.
+    True on AMD processors for which Linux reports the instructions; not measured on Intel's.
     """
     return {"AuthenticAMD", "avx512_bf16"} <= _features()
 
@@ -102,8 +102,8 @@ def has_bfloat16_products() -> bool:
 def has_fast_bfloat16() -> bool:
     """Whether PyTorch's convolutions and matrix products are faster in bfloat16 than in single precision on this CPU.
 
-    That is so by AMX and where `has_bfloat16_products` (convolutions take 0.54 to 0.58 of the time on a Zen 4);
-    `ONEDNN_MAX_CPU_ISA` may keep oneDNN from either.
+    True with AMX and where `has_bfloat16_products` (convolutions take 0.54 to 0.58 of the time on a Zen 4);
+    `ONEDNN_MAX_CPU_ISA` may forbid both to oneDNN.
     """
     limit = os.environ.get("ONEDNN_MAX_CPU_ISA", "ALL").upper()
     unlimited = limit in ("ALL", "DEFAULT")
@@ -114,12 +114,12 @@ def has_fast_bfloat16() -> bool:
 
 
 def usable_cores() -> int:
-    """How many cores this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def environment() -> dict[str, object]:
-    """The commit, the processor and the versions, as they stand in the JSON files of results."""
+    """The commit, the processor and the versions, for the JSON files of results."""
     import torch
 
     return {

@@ -1,4 +1,4 @@
-"""Errors that say which object or file they are about."""
+"""Error messages: names of objects and options in them, suggestions, and one line for the command line."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ TRACEBACK_VARIABLE = "HYPERPLANES_TRACEBACK"
 
 
 class MissingPackageError(RuntimeError):
-    """A package that not everybody needs is not installed; the message says how to install it."""
+    """An optional package is not installed; the message says how to install it."""
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """The end of a message about an unknown name: the nearest one that there is, or nothing.
+    """The end of a message about an unknown name: the nearest known one, or nothing.
 
     >>> did_you_mean("hyperplane", ["hyperplanes", "nerf"])
     '; did you mean hyperplanes?'
@@ -38,7 +38,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
-    """What to say after an unknown name: the nearest one that there is, or all of them.
+    """The suggestion after an unknown name: the nearest known one, or all of them.
 
     >>> nearest("stpes", ["rays", "steps"])
     'did you mean steps?'
@@ -48,10 +48,10 @@ def nearest(name: str, known: Sequence[str]) -> str:
 
 @contextmanager
 def prefix_errors(name: str) -> Generator[None]:
-    """Puts a name before the message of every ValueError raised within.
+    """Prefix the message of every ValueError raised within with a name.
 
     Raises:
-        ValueError: as the one that was raised, with the name before it.
+        ValueError: with the prefixed message.
     """
     try:
         yield
@@ -61,7 +61,7 @@ def prefix_errors(name: str) -> Generator[None]:
 
 @contextmanager
 def rename_errors(argument: str, option: str) -> Generator[None]:
-    """Puts the name that was typed in place of an argument's, with which a ValueError raised within begins.
+    """Replace an argument's name at the start of ValueErrors raised within by that of the option.
 
     >>> with rename_errors("level", "--level"):
     ...     raise ValueError("level: expected more than 0")
@@ -69,7 +69,7 @@ def rename_errors(argument: str, option: str) -> Generator[None]:
     ValueError: --level: expected more than 0
 
     Raises:
-        ValueError: as the one that was raised.
+        ValueError: with the renamed argument.
     """
     try:
         yield
@@ -80,12 +80,12 @@ def rename_errors(argument: str, option: str) -> Generator[None]:
 
 
 def wants_traceback() -> bool:
-    """Whether TRACEBACK_VARIABLE asks to be shown where errors came from."""
+    """Whether TRACEBACK_VARIABLE asks for tracebacks."""
     return os.environ.get(TRACEBACK_VARIABLE, "") not in ("", "0")
 
 
 def one_line(error: Exception) -> str:
-    """What to say of an error with which a command ended: of wrong input, a full disk or too little memory."""
+    """The message of an error that ended a command: wrong input, a full disk or too little memory."""
     if is_memory(error):
         found = " ".join(str(error).split("\n")[0].split()) or "none left"
         return f"expected enough memory, found {found}; ask for smaller or fewer pictures, voxels or processes"
@@ -98,5 +98,5 @@ def one_line(error: Exception) -> str:
 
 
 def is_memory(error: Exception) -> bool:
-    """Whether there was too little memory, for Python or for PyTorch, which says so in words."""
+    """Whether Python or PyTorch, which says so in its message, ran out of memory."""
     return isinstance(error, MemoryError) or "can't allocate memory" in str(error) or "out of memory" in str(error)

@@ -1,4 +1,4 @@
-"""Reading whole files: only regular ones, checked JSON, safe paths, and what is said of those that are malformed."""
+"""Reading whole files: regular files only, checked JSON, safe paths, and errors for malformed content."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ __all__ = [
 ]
 
 LARGEST_JSON = 256 * 2**20
-"""Bytes above which a JSON file is refused unread."""
+"""Largest JSON file that is read, in bytes."""
 
 LARGEST_FILE = 2 * 2**30
-"""Bytes above which any other file that is read whole is refused unread."""
+"""Largest other file that is read whole, in bytes."""
 
 MALFORMED = (
     ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, RuntimeError,
     SyntaxError, TypeError, ValueError, struct.error, zipfile.BadZipFile, tokenize.TokenError, zlib.error,
 )  # fmt: skip
-"""What parsers raise where content is not what they took for granted."""
+"""What parsers raise on unexpected content."""
 
 
 class DataError(ValueError):
-    """A file is not what it should be: one line that names it, what was expected, what was found, what to do.
+    """A file with wrong content: one line with its name, what was expected, what was found, and what to do.
 
     Args:
         where: the file or folder; alone, the whole message.
@@ -62,10 +62,10 @@ class DataError(ValueError):
 
 @contextmanager
 def malformed(path: str | Path, expected: str) -> Generator[None]:
-    """Turns what parsers raise on content that they did not expect into a DataError that names the file.
+    """Turn what parsers raise on unexpected content into a DataError that names the file.
 
-    For the few places where bytes become values: a file that nobody foresaw is a wrong input and no fault of the
-    program. DataErrors and errors of the operating system pass as they are.
+    For the few places where bytes become values: a malformed file is a wrong input, not a bug. DataErrors and errors of
+    the operating system pass unchanged.
 
     Raises:
         DataError: any of MALFORMED.
@@ -80,14 +80,14 @@ def malformed(path: str | Path, expected: str) -> Generator[None]:
 
 
 def check_regular(path: str | Path, largest: int = LARGEST_FILE, root: str | Path | None = None) -> int:
-    """The size in bytes of a regular file, or of what a link to one leads to; FileNotFoundError where there is none.
+    """The size in bytes of a regular file, links followed; FileNotFoundError where there is none.
 
-    Opening a pipe waits for a writer for ever, and reading a device may never end.
+    Opening a pipe would wait for a writer for ever, and reading a device might never end.
 
     Args:
         path: the file.
-        largest: bytes above which it is refused.
-        root: a folder that it may not lie outside of, symbolic links followed; anywhere when None.
+        largest: most bytes.
+        root: a folder that must contain it, symbolic links followed; any when None.
 
     Raises:
         DataError: a folder, pipe, socket or device, too large a file, or a link that leads out of the root.
@@ -108,7 +108,7 @@ def check_link(path: str | Path, root: str | Path) -> None:
     """Check that a path lies inside a folder, symbolic links followed.
 
     Args:
-        path: of a file or a folder, which need not be there.
+        path: of a file or a folder, which need not exist.
         root: the folder.
 
     Raises:
@@ -124,8 +124,8 @@ def list_files(folder: str | Path, suffixes: Collection[str], root: str | Path |
     """The files of a folder with certain endings, sorted by name.
 
     Args:
-        folder: to look into, not into the folders in it.
-        suffixes: the endings, in small letters.
+        folder: the folder; subfolders are not searched.
+        suffixes: the endings, in lower case.
         root: as in `check_regular`, for each of the files; the folder itself when None.
 
     Returns:
@@ -139,17 +139,17 @@ def list_files(folder: str | Path, suffixes: Collection[str], root: str | Path |
 
 
 def folder_checksum(folder: str | Path, but: str | Path | None = None) -> str:
-    """A checksum of what a folder holds, by which a change is noticed without reading every file.
+    """A checksum that notices changes of a folder without reading every file.
 
-    It is that of the names and sizes of all files, and of their times of modification, or in place of these of the
-    content of a `manifest.json`, which says what a data set holds: one that was copied or made again is the same.
+    It covers the names and sizes of all files, and their modification times, or instead of these the content of
+    `manifest.json` where a data set has one: copied or generated again, it has the same checksum.
 
     Args:
-        folder: whose files count at any depth, links followed to each folder once, but for hidden files and folders.
-        but: a folder in it whose files do not count.
+        folder: its files at any depth count, but for hidden files and folders; links to each folder are followed once.
+        but: a folder in it to leave out.
 
     Returns:
-        Ten hexadecimal digits; those of an empty folder where there is none.
+        Ten hexadecimal digits; those of an empty folder if it does not exist.
     """
     root = Path(folder).resolve()
     manifest = root / "manifest.json"
@@ -158,7 +158,7 @@ def folder_checksum(folder: str | Path, but: str | Path | None = None) -> str:
     files: list[tuple[str, int, int]] = []
     for place, folders, names in os.walk(root, followlinks=True):
         inner = {os.path.realpath(os.path.join(place, name)): name for name in sorted(folders) if name[0] != "."}
-        folders[:] = [name for target, name in inner.items() if target not in seen]  # which os.walk looks into
+        folders[:] = [name for target, name in inner.items() if target not in seen]  # what os.walk visits next
         seen |= inner.keys()
         for name in names:
             path = os.path.join(place, name)
@@ -169,13 +169,13 @@ def folder_checksum(folder: str | Path, but: str | Path | None = None) -> str:
 
 
 def read_bytes(path: str | Path, largest: int = LARGEST_FILE, root: str | Path | None = None) -> bytes:
-    """The content of a regular file; as `check_regular`."""
+    """The content of a regular file; arguments and errors as in `check_regular`."""
     check_regular(path, largest, root)
     return Path(path).read_bytes()
 
 
 def read_text(path: str | Path, largest: int = LARGEST_JSON, root: str | Path | None = None) -> str:
-    """The content of a regular file of UTF-8; as `check_regular`, and UnicodeDecodeError where it is no text."""
+    """The text of a regular UTF-8 file; as `check_regular`, and UnicodeDecodeError if it is not text."""
     return read_bytes(path, largest, root).decode("utf-8")
 
 
@@ -187,8 +187,8 @@ def read_json(path: str | Path, root: str | Path | None = None) -> dict[str, Any
         root: as in `check_regular`.
 
     Raises:
-        DataError: no such file, not a regular one, too large, not JSON, not an object, or a whole number beyond 64
-            bits, which neither NumPy nor PyTorch has.
+        DataError: no such file, not a regular one, too large, not JSON, not an object, or an integer beyond the
+            64 bits of NumPy and PyTorch.
     """
     path = Path(path)
     try:
@@ -212,22 +212,22 @@ def _whole_number(digits: str) -> int:
     return int(digits)
 
 
-LONGEST_NAME = 255  # bytes of a part of a path, on every common file system
+LONGEST_NAME = 255  # bytes of one name on common file systems
 
 
 def inside(folder: str | Path, relative: str, source: str | Path) -> Path:
-    """The path of a file named in another file, which may not leave the folder.
+    """The path of a file named in another file, checked to lie in a folder.
 
     Args:
-        folder: what must hold the file, symbolic links followed.
+        folder: the folder that must contain it, symbolic links followed.
         relative: the name as it was written.
         source: the file that names it, for the message.
 
     Returns:
-        The path; whether there is such a file is not looked at.
+        The path; the file need not exist.
 
     Raises:
-        DataError: an absolute path, one that leaves the folder, or a name that no file can have.
+        DataError: an absolute path, one that leaves the folder, or an impossible file name.
     """
     root = Path(folder).resolve()
     text = relative.replace("\\", "/") if isinstance(relative, str) else ""
@@ -244,11 +244,11 @@ def inside(folder: str | Path, relative: str, source: str | Path) -> Path:
 
 
 def format_of(path: str | Path, formats: Sequence[str]) -> str:
-    """The format of a file that is to be written, by the ending of its name, in small letters.
+    """The format of a file to be written, by the ending of its name, in lower case.
 
     Args:
         path: the file.
-        formats: the known ones.
+        formats: the supported endings.
 
     Raises:
         ValueError: another ending.

@@ -24,10 +24,11 @@ def format_duration(seconds: float) -> str:
 def format_rate(value: float) -> str:
     """A large number in thousands or millions.
 
-    >>> format_rate(950), format_rate(12345), format_rate(2.5e6)
-    ('950', '12.3k', '2.5M')
+    >>> [format_rate(value) for value in (950, 999.6, 12345, 999_960, 2.5e6)]
+    ['950', '1.0k', '12.3k', '1.0M', '2.5M']
     """
-    for size, letter in ((1e6, "M"), (1e3, "k")):
-        if value >= size:
-            return f"{value / size:.1f}{letter}"
-    return f"{value:.0f}"
+    if value < 999.5:
+        return f"{value:.0f}"
+    if value < 999_950:
+        return f"{value / 1e3:.1f}k"
+    return f"{value / 1e6:.1f}M"

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP as exceptions that end a command, wherever it is."""
+"""Ctrl-C, SIGTERM and SIGHUP as exceptions that end a command at any point."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typing import Any
 __all__ = ["SIGNALS", "HungUp", "Terminated", "interrupt_behind", "interruptible", "keep_handlers", "listened_to"]
 
 AGAIN_SECONDS = 0.2
-"""After which an interrupt that was swallowed is raised again."""
+"""Seconds after which a swallowed interrupt is raised again."""
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as `kill` and clusters send it: ends a verb as Ctrl-C does, with another exit code."""
+    """SIGTERM, from `kill` or a cluster: ends a command like Ctrl-C, with another exit code."""
 
     code = 128 + signal.SIGTERM
 
 
 class HungUp(Terminated):
-    """SIGHUP, as a terminal sends it that is closed: likewise."""
+    """SIGHUP, from a closed terminal: likewise."""
 
     code = 128 + signal.SIGHUP
 
@@ -36,7 +36,7 @@ SIGNALS: dict[int, type[KeyboardInterrupt]] = {
 
 
 def listened_to() -> list[int]:
-    """Those of SIGNALS that are not ignored, as `nohup` ignores one and a shell without job control another."""
+    """The SIGNALS that are not ignored: `nohup` ignores one, a shell without job control another."""
     return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
@@ -44,9 +44,9 @@ def listened_to() -> list[int]:
 def interruptible() -> Generator[None]:
     """SIGINT raises KeyboardInterrupt, SIGTERM `Terminated` and SIGHUP `HungUp` within, until the exception leaves it.
 
-    Once is not enough: where native code calls Python (the compiler, the garbage collector), what is raised there is
-    printed and lost. So a timer raises it again, except while it is being passed on through cleaning up. In threads
-    other than the main one, which signals do not reach, nothing is changed, nor is a signal that is ignored.
+    Once is not enough: an exception in Python code that native code calls (the compiler, the garbage collector) is
+    printed and lost. So a timer raises it again, except during clean-up code that passes it on. Ignored signals and
+    threads other than the main one, which receive no signals, are unaffected.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -84,10 +84,10 @@ def interruptible() -> Generator[None]:
 
 @contextmanager
 def keep_handlers() -> Generator[None]:
-    """Python's handlers of SIGNALS are in place again afterwards, whatever native code has put over them.
+    """Restore Python's handlers of SIGNALS afterwards, if native code has replaced them.
 
-    Python does not see that: `signal.getsignal` goes on naming its own. The import of pycolmap does so (glog prints a
-    stack trace for SIGTERM). Only the main thread can put them back.
+    `signal.getsignal` does not show that. Importing pycolmap replaces them (glog prints a stack trace for SIGTERM).
+    Only the main thread can restore them.
     """
     try:
         yield
@@ -99,7 +99,7 @@ def keep_handlers() -> Generator[None]:
 
 
 def interrupt_behind(error: BaseException | None) -> BaseException | None:
-    """The interrupt, or the closing of a generator, that an exception is or was raised in answer to; None for others.
+    """The interrupt, or GeneratorExit, that an exception is or was raised in response to; None for others.
 
     >>> try:
     ...     try:
@@ -116,5 +116,5 @@ def interrupt_behind(error: BaseException | None) -> BaseException | None:
 
 
 def _is_passed_on() -> bool:
-    """Whether the main thread is in a `finally` or `except` of an interrupt, or in that of a generator being closed."""
+    """Whether the main thread handles an interrupt in a `finally` or `except`, or closes a generator."""
     return interrupt_behind(sys.exception()) is not None

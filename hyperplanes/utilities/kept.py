@@ -1,4 +1,4 @@
-"""What is computed from tensors, kept until one of them changes in place."""
+"""Values computed from tensors, cached until one of them changes in place."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Made = TypeVar("Made")
 
 
 def kept(owner: object, name: str, tensors: Sequence[Tensor], make: Callable[[], Made]) -> Made:
-    """What is made of some tensors: made once for an object, and anew where they have changed in place.
+    """A value computed from tensors, cached on an object and recomputed when one of them has changed in place.
 
-    Inference tensors do not count their changes, and are taken to have none. Nothing is kept of what a function
-    transform makes, and while a graph is compiled what was made before it is taken.
+    Inference tensors, which have no version counter, are assumed not to change. Nothing is cached under function
+    transforms; during graph compilation an existing value is used.
 
     Args:
-        owner: that it is kept with, as `__dict__["_kept_NAME"]`, which its copies and pickles may leave out.
-        name: of what is made.
-        tensors: that it is made of.
-        make: called without arguments.
+        owner: the object, which stores it as `__dict__["_kept_NAME"]`; copies and pickles may leave that out.
+        name: name of the value.
+        tensors: what it is computed from.
+        make: computes it, without arguments.
     """
     found = owner.__dict__.get(f"_kept_{name}")
     if torch.compiler.is_compiling():
@@ -34,6 +34,6 @@ def kept(owner: object, name: str, tensors: Sequence[Tensor], make: Callable[[],
         return make()
     state = [(each.data_ptr(), 0 if each.is_inference() else each._version) for each in tensors]
     if found is None or found[0] != state:
-        found = state, make(), list(tensors)  # whose memory is not another's as long as they live
-        owner.__dict__[f"_kept_{name}"] = found  # threads that come at once make the same
+        found = state, make(), list(tensors)  # kept alive, so that no other tensor gets their memory
+        owner.__dict__[f"_kept_{name}"] = found  # concurrent threads compute the same
     return found[1]

@@ -18,11 +18,11 @@ Value = TypeVar("Value", bound=_Sized)
 
 
 class LRUCache(Generic[Value]):
-    """Values by name; the least recently used are dropped when they take more than some bytes.
+    """Values by name; the least recently used are dropped when the total exceeds a number of bytes.
 
     Args:
-        budget: bytes.
-        keep_last: the newest value stays even where it alone takes more than the budget; otherwise it is not kept.
+        budget: most bytes.
+        keep_last: keep the newest value even if it alone exceeds the budget; otherwise it is not stored.
     """
 
     def __init__(self, budget: int, *, keep_last: bool = False) -> None:
@@ -38,13 +38,13 @@ class LRUCache(Generic[Value]):
         return name in self._values
 
     def get(self, name: str) -> Value | None:
-        """The value of that name, where it is still there."""
+        """The value of that name, if still stored."""
         if name in self._values:
             self._values.move_to_end(name)
         return self._values.get(name)
 
     def add(self, name: str, value: Value) -> None:
-        """Keep one more."""
+        """Store a value."""
         if name in self._values:
             self.nbytes -= self._values.pop(name).nbytes
         self._values[name] = value

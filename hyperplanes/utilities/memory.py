@@ -1,4 +1,4 @@
-"""How much memory is free, asked before much of it is taken."""
+"""Free memory, checked before large allocations."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from pathlib import Path
 __all__ = ["available_memory", "require_memory"]
 
 SMALL = 2**30
-"""Bytes that are taken without asking."""
+"""Bytes below which nothing is checked."""
 
 
 def available_memory() -> int | None:
-    """Bytes that this process may still take without swapping, by the machine and its control group; None unknown."""
+    """Bytes available to this process without swapping, by machine and control group; None if unknown."""
     found = []
     try:
         lines = Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
         found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
         group = Path("/sys/fs/cgroup")
         limit, used, kinds = ((group / f"memory.{name}").read_text().strip() for name in ("max", "current", "stat"))
-        # files that the kernel keeps, and gives back when asked for
+        # cached files, which the kernel frees on demand
         cached = dict(line.split() for line in kinds.splitlines()).get("inactive_file", "0")
         found += [int(limit) - int(used) + int(cached)] if limit.isdigit() else []
     except (OSError, ValueError):
@@ -30,12 +30,12 @@ def available_memory() -> int | None:
 
 
 def require_memory(what: str, found: object, needed: float, remedy: str) -> None:
-    """Refuse what does not fit into the memory that is free.
+    """Refuse what does not fit into the free memory.
 
     Args:
-        what: the argument that says how much is wanted.
+        what: the argument that sets the size.
         found: its value.
-        needed: bytes, about.
+        needed: approximate number of bytes.
         remedy: what to do.
 
     Raises:
@@ -44,6 +44,6 @@ def require_memory(what: str, found: object, needed: float, remedy: str) -> None
     if needed <= SMALL or (free := available_memory()) is None or needed <= free:
         return
     raise ValueError(
-        f"{what}: expected what fits into the {free / 1e9:.1f} GB of memory that are free, got {found}, which takes "
+        f"{what}: expected a size that fits into the {free / 1e9:.1f} GB of free memory, got {found}, which needs "
         f"{needed / 1e9:,.0f} GB; {remedy}"
     )

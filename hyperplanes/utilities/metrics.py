@@ -1,4 +1,4 @@
-"""How good pictures are: PSNR of each, of all, of the object alone, and SSIM."""
+"""Image metrics: PSNR of each image, of all together, of the object alone, and SSIM."""
 
 from __future__ import annotations
 
@@ -26,10 +26,13 @@ def psnr(
     return -10 * torch.log10((predicted - truth).square().flatten(1).mean(1))
 
 
+@checked
 def pooled_psnr(
     predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
 ) -> Float[Tensor, ""]:
     """PSNR in dB of the squared error of all images together; never above the mean of `psnr`.
+
+    Images of different shapes are a ValueError.
 
     >>> truth = torch.zeros(2, 3, 4, 4)
     >>> pooled_psnr(truth + torch.tensor([0.1, 0.0]).view(2, 1, 1, 1), truth).round(decimals=2).item()
@@ -39,20 +42,27 @@ def pooled_psnr(
     return -10 * torch.log10((predicted - truth).square().mean())
 
 
+@checked
 def foreground_psnr(
     predicted: Float[Tensor, "view 3 height width"],
     truth: Float[Tensor, "view 3 height width"],
     masks: Float[Tensor, "view 1 height width"],
 ) -> Float[Tensor, " view"]:
-    """PSNR in dB of each image where the true mask is above one half; NaN where it is nowhere.
+    """PSNR in dB of each image over the pixels whose true mask is above one half; NaN where there are none.
 
-    Background that both leave white counts for nothing here, so it does not depend on how much of it there is.
+    White background does not count, so the value does not depend on its area.
+
+    Raises:
+        ValueError: images of different shapes, or masks of another size or number.
 
     >>> truth, masks = torch.zeros(1, 3, 2, 2), torch.tensor([[[[1.0, 0.0], [0.0, 0.0]]]])
     >>> foreground_psnr(truth + torch.tensor([[0.1, 1.0], [1.0, 1.0]]), truth, masks).round(decimals=2).tolist()
     [20.0]
     """
     _check(predicted, truth)
+    expected = (len(truth), 1, *truth.shape[2:])
+    if masks.shape != expected:
+        raise ValueError(f"masks: expected one an image, {expected}, got {tuple(masks.shape)}")
     inside = (masks > 0.5).to(truth)
     error = ((predicted - truth).square().mean(1, keepdim=True) * inside).flatten(1).sum(1)
     return -10 * torch.log10(error / inside.flatten(1).sum(1))
@@ -62,7 +72,7 @@ def foreground_psnr(
 def ssim(
     predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
 ) -> Float[Tensor, " view"]:
-    """Structural similarity of each image: Gaussian window of 11 pixels, sigma 1.5, mean over what it fully covers.
+    """Structural similarity of each image: Gaussian window of 11 pixels, sigma 1.5, mean where it lies in the image.
 
     Equals scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)`.
 
@@ -78,7 +88,7 @@ def ssim(
 
 
 def _check(predicted: Tensor, truth: Tensor) -> None:
-    """Pictures of one shape: otherwise they would be stretched over each other without a word."""
+    """Require equal shapes: others would be broadcast silently."""
     if predicted.shape != truth.shape:
         raise ValueError(
             f"predicted: expected the shape of the truth, {tuple(truth.shape)}, got {tuple(predicted.shape)}"

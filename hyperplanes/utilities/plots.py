@@ -35,19 +35,19 @@ Points = Sequence[tuple[float, float]]
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of so many inches that needs no display."""
+    """An empty figure, its size in inches, that needs no display."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all, as `figure_kind` says. The same figure, the same bytes."""
+    """Write a figure atomically, in the format of `figure_kind`. The same figure gives the same bytes."""
     write_whole(path, encode_figure(figure, figure_kind(path)))
 
 
 def figure_kind(path: Path) -> str:
-    """The format that the ending of a figure's name stands for, such as "svg".
+    """The format of a figure by its file name, such as "svg".
 
     Raises:
         ValueError: an ending that matplotlib does not know.
@@ -60,7 +60,7 @@ def figure_kind(path: Path) -> str:
 
 
 def encode_figure(figure: Figure, kind: str) -> bytes:
-    """A figure as a file of a kind, such as "svg", whose words stay words; the same figure, the same bytes."""
+    """A figure as a file in a format such as "svg", text kept as text; the same figure gives the same bytes."""
     import matplotlib
 
     buffer = io.BytesIO()
@@ -70,7 +70,7 @@ def encode_figure(figure: Figure, kind: str) -> bytes:
 
 
 def set_counts(axes: Axes, counts: Iterable[float]) -> None:
-    """A horizontal axis of growing numbers that may begin at 0: logarithmic from 1 on, a tick a number."""
+    """A horizontal axis with a tick for each of increasing numbers: logarithmic from 1 on, linear from 0 to 1."""
     from matplotlib.ticker import NullLocator
 
     axes.set_xscale("symlog", linthresh=1)
@@ -86,7 +86,7 @@ def draw_lines(
     deviations: Mapping[str, Sequence[float]] | None = None,
     marks: bool = False,
 ) -> None:
-    """A line a series, named in a legend, perhaps with a band of a deviation about it; empty ones are left out."""
+    """A line for each series, named in a legend, optionally with a deviation band; empty ones are left out."""
     for (name, points), colour in zip(series.items(), _colours(len(series)), strict=True):
         if not points:
             continue
@@ -109,13 +109,13 @@ def draw_bars(
         places = np.arange(len(groups)) + width * (index - (len(series) - 1) / 2)
         axes.bar(places, values, width * 0.95, yerr=spread, color=colour, label=name, error_kw={"linewidth": 1})
     axes.set_xticks(range(len(groups)), groups)
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the bars, which fill the axes
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the axes, which the bars fill
     axes.grid(alpha=0.3, axis="y")
     axes.set_axisbelow(True)
 
 
 def draw_boxes(axes: Axes, samples: Mapping[str, Sequence[float]]) -> None:
-    """A box a sample: median, quartiles, whiskers to the last value within one and a half boxes, the values as dots."""
+    """A box for each sample: median, quartiles, whiskers up to 1.5 times the box, and the values as dots."""
     axes.boxplot(list(samples.values()), tick_labels=list(samples), showfliers=False, medianprops={"color": COLOURS[0]})
     for place, values in enumerate(samples.values(), 1):
         spread = np.linspace(-0.12, 0.12, len(values)) if len(values) > 1 else np.zeros(1)
@@ -124,10 +124,10 @@ def draw_boxes(axes: Axes, samples: Mapping[str, Sequence[float]]) -> None:
 
 
 def draw_grid(rows: Sequence[Sequence[npt.NDArray[np.uint8]]], columns: Sequence[str], labels: Sequence[str]) -> Figure:
-    """Pictures in rows under headings, pixels as they are.
+    """Pictures in rows under headings, without interpolation.
 
     Args:
-        rows: of pictures (height, width, 3), all of the columns' number.
+        rows: pictures (height, width, 3), one for each column.
         columns: headings.
         labels: of the rows.
 

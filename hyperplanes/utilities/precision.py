@@ -1,4 +1,4 @@
-"""Functions that compute in the precision of their inputs, whatever `torch.autocast` says."""
+"""Functions that compute in the precision of their inputs, regardless of `torch.autocast`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DEVICES = ("cpu", "cuda")
 def without_autocast(function: Callable[Given, Result]) -> Callable[Given, Result]:
     """A function that turns `torch.autocast` off while it runs: rays in bfloat16 miss their pixels.
 
-    A network that may compute in less says so itself (`Field.mixed_precision`, `TrainingConfig.precision`).
+    Networks that may compute in less say so themselves (`Field.mixed_precision`, `TrainingConfig.precision`).
     """
 
     @functools.wraps(function)

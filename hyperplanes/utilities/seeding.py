@@ -1,4 +1,4 @@
-"""First weights that a seed decides, and nothing else."""
+"""Weight initialisation determined by a seed alone."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _alone = RLock()
 
 @contextmanager
 def seeded(seed: int) -> Generator[None]:
-    """PyTorch's global generator on the CPU, from which modules draw first weights, with a seed; then as it was before.
+    """Seed PyTorch's global CPU generator, from which modules draw initial weights; restore its state afterwards.
 
-    The contexts of several threads last one after the other.
+    Threads enter this one after the other.
     """
     with _alone, torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)  # `torch.manual_seed` would seed GPUs, too

@@ -1,6 +1,6 @@
-"""Dataclasses made of the plain values in a file, every entry checked: its name, its type and its range.
+"""Dataclasses from the plain values of a file, with checks of every entry's name, type and range.
 
-A whole number's range is declared where the field is: `depth: Annotated[int, range(1, 257)] = 8`.
+The range of an integer is declared with the field: `depth: Annotated[int, range(1, 257)] = 8`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class SettingsError(ValueError):
     """One entry that cannot be used.
 
     Args:
-        path: of the entry, such as "network.depth"; empty where all of it is meant.
+        path: of the entry, such as "network.depth"; empty for the whole.
         problem: what is wrong with it.
     """
 
@@ -53,33 +53,33 @@ def structure(kind: type[Made], value: object, path: str = "") -> Made:
         path: of the value in the file.
 
     Returns:
-        The dataclass. A whole number stands for a real one, nothing else is converted. An unknown entry, one of another
-        type, a number out of its range or not finite, or a value that the dataclass itself refuses is a SettingsError;
-        the first of them counts.
+        The dataclass. Integers are converted to floats and lists to tuples, nothing else. An unknown entry, another
+        type, a number out of range or not finite, or a value that the dataclass refuses raises a SettingsError for the
+        first of them.
     """
     return _dataclass(kind, value, path)
 
 
 def choose_by_tag(union: Any, tag: str, kinds: Mapping[str, type]) -> None:
-    """Let an entry of that name say which dataclass of a union is meant.
+    """Let an entry select the dataclass of a union.
 
     Args:
-        union: of dataclasses, and of None where there may be none.
-        tag: the entry.
-        kinds: the dataclasses by what the entry may be.
+        union: of dataclasses, and None if optional.
+        tag: name of the entry.
+        kinds: the dataclasses by value of the entry.
     """
     _TAGGED[union] = tag, kinds
 
 
 def tagged(value: Any, tag: str, kinds: Mapping[str, type]) -> dict[str, Any] | None:
-    """The entries of a dataclass with the one that `choose_by_tag` asks; None of None."""
+    """The entries of a dataclass and its tag, as `choose_by_tag` expects; None for None."""
     if value is None:
         return None
     return {tag: next(name for name, kind in kinds.items() if type(value) is kind), **asdict(value)}
 
 
 def flattened(entries: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The values of nested mappings by their names joined with dots.
+    """Nested mappings as one, with names joined by dots.
 
     >>> flattened({"a": {"b": 1, "c": 2}})
     {'a.b': 1, 'a.c': 2}
@@ -115,7 +115,7 @@ def _mapping(value: object, path: str) -> Mapping[Any, Any]:
 
 
 def _entry(hint: Any, value: Any, path: str) -> Any:
-    """The value of a field of that annotation, made of what a file holds."""
+    """The value of a field with this annotation, from the value in a file."""
     if value is None and NoneType in get_args(hint):
         return None
     if hint in _TAGGED:
@@ -125,7 +125,7 @@ def _entry(hint: Any, value: Any, path: str) -> Any:
         if not isinstance(chosen, str) or chosen not in kinds:
             raise SettingsError(path, f"{tag}: expected one of {', '.join(kinds)}, got {kind_of(chosen)}")
         return _dataclass(kinds[chosen], {name: entry for name, entry in entries.items() if name != tag}, path)
-    for part in get_args(hint) if NoneType in get_args(hint) else (hint,):
+    for part in _kinds(hint):
         if is_dataclass(part):
             return _dataclass(part, value, path)
     value = _converted(hint, value)
@@ -138,9 +138,15 @@ def _entry(hint: Any, value: Any, path: str) -> Any:
 
 
 def _converted(hint: Any, value: Any) -> Any:
-    """A list as a tuple, whose elements are of one type, and a whole number as a real one, where these are expected."""
-    if get_origin(hint) is tuple and isinstance(value, list):
-        return tuple(_converted(get_args(hint)[0], each) for each in value)
-    if hint in (float, float | None) and type(value) is int and abs(value) < 2**63:
-        return float(value)
+    """Lists become tuples, all elements of one type, and integers become floats, where these are expected."""
+    for part in _kinds(hint):
+        if get_origin(part) is tuple and isinstance(value, list):
+            return tuple(_converted(get_args(part)[0], each) for each in value)
+        if part is float and type(value) is int and abs(value) < 2**63:
+            return float(value)
     return value
+
+
+def _kinds(hint: Any) -> tuple[Any, ...]:
+    """The parts of a union with None; any other annotation alone."""
+    return get_args(hint) if NoneType in get_args(hint) else (hint,)

@@ -1,4 +1,4 @@
-"""Commands that a person is to copy into a shell."""
+"""Commands to copy into a shell."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["command_line"]
 
 
 def command_line(*words: object) -> str:
-    """The words of a command, quoted where a shell would divide or replace them.
+    """The words of a command, quoted where a shell needs it.
 
     >>> from pathlib import Path
     >>> command_line("hyperplanes", "view", Path("my scene"))
@@ -17,7 +17,7 @@ def command_line(*words: object) -> str:
     'hyperplanes view scene --steps 100'
 
     Args:
-        words: one after the other, lists and tuples word by word.
+        words: in order; lists and tuples are flattened.
     """
     parts = (word if isinstance(word, list | tuple) else [word] for word in words)
     return shlex.join(str(word) for part in parts for word in part)

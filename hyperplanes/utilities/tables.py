@@ -26,7 +26,7 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
 
 
 def csv_table(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A table as comma-separated values, numbers in full.
+    """A table as comma-separated values, numbers in full precision.
 
     >>> print(csv_table(["method", "psnr"], [["a,b", 1.5]]), end="")
     method,psnr

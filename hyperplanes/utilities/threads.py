@@ -1,4 +1,4 @@
-"""How the threads of OpenMP wait for each other: asleep, not spinning."""
+"""OpenMP threads that sleep instead of spinning while they wait."""
 
 from __future__ import annotations
 
@@ -10,19 +10,14 @@ __all__ = ["wait_passively"]
 DECIDED_BY = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 
 
-def wait_passively() -> bool:
-    """Have the threads of PyTorch's OpenMP sleep while they wait, where nobody has decided how they do.
+def wait_passively() -> None:
+    """Let the threads of PyTorch's OpenMP sleep while they wait, unless the environment says how they wait.
 
-    By default they spin: beside other processes on the same cores, a thread that spins keeps the one it waits for from
+    By default they spin: with other processes on the same cores, a spinning thread keeps the one it waits for from
     running, and two threads take up to ten times as long as one (`python -m benchmarks busy`). On an idle machine
-    spinning is some 15 % faster. OpenMP reads the variable when PyTorch is loaded, so this is to be called before that;
-    processes started from here inherit it.
-
-    Returns:
-        Whether threads of this process will sleep because of this call: not where one of the variables
-        OMP_WAIT_POLICY, GOMP_SPINCOUNT or KMP_BLOCKTIME is set, or PyTorch is loaded.
+    spinning is some 15 % faster. OpenMP reads the variable when PyTorch is loaded, so call this before; child processes
+    inherit it. Nothing changes where OMP_WAIT_POLICY, GOMP_SPINCOUNT or KMP_BLOCKTIME is
+    set, or PyTorch is loaded.
     """
-    if "torch" in sys.modules or any(name in os.environ for name in DECIDED_BY):
-        return False
-    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-    return True
+    if "torch" not in sys.modules and not any(name in os.environ for name in DECIDED_BY):
+        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"

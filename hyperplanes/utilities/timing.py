@@ -1,4 +1,4 @@
-"""Seconds of what is done, and not of what is queued."""
+"""A clock that waits for queued GPU work first."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["clock"]
 
 
 def clock() -> float:
-    """The performance counter in seconds, when all that was queued on a GPU is done."""
+    """The performance counter in seconds, after all queued GPU work is done."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.synchronize()
     return time.perf_counter()

@@ -1,4 +1,4 @@
-"""What is wanted of tensors beside values, and no compiled kernel knows: derivatives, function transforms, graphs."""
+"""Uses of tensors that compiled kernels do not support: derivatives, function transforms, graph capture."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = [
 
 
 def transform_of(*tensors: Tensor) -> str | None:
-    """Which of PyTorch's function transforms these tensors are under; None while a graph is compiled."""
+    """The kind of PyTorch's transforms these tensors are under, if any; None while a graph is compiled."""
     if torch.compiler.is_compiling():
         return None
     if torch._C._are_functorch_transforms_active():
@@ -34,7 +34,7 @@ def transform_of(*tensors: Tensor) -> str | None:
 def are_plain(*tensors: Tensor) -> bool:
     """Whether the memory of these tensors can be read now: no graph is compiled or traced, and no transform is active.
 
-    Gradients may be wanted.
+    Gradients may be required.
     """
     if torch.compiler.is_compiling() or torch.jit.is_tracing():  # pyright: ignore[reportPrivateImportUsage]
         return False
@@ -42,7 +42,7 @@ def are_plain(*tensors: Tensor) -> bool:
 
 
 def wants_values_alone(*tensors: Tensor) -> bool:
-    """Whether nothing but the values of what is computed of these tensors is wanted: no derivative, no graph."""
+    """Whether only values are to be computed from these tensors: no derivatives, no graph."""
     if torch.is_grad_enabled() and any(value.requires_grad for value in tensors):
         return False
     return are_plain(*tensors)
@@ -50,19 +50,19 @@ def wants_values_alone(*tensors: Tensor) -> bool:
 
 @contextmanager
 def without_derivatives() -> Generator[None, None, None]:
-    """As `torch.no_grad`, of forward-mode derivatives, too."""
+    """As `torch.no_grad`, for forward-mode derivatives, too."""
     with torch.no_grad(), forward_ad._set_fwd_grad_enabled(False):
         yield
 
 
 def is_transformed(*tensors: Tensor) -> bool:
-    """Whether a transform of `torch.func` has made one of these tensors: others are constants to it."""
+    """Whether a transform of `torch.func` wraps one of these tensors; others are constants to it."""
     return any(is_functorch_wrapped_tensor(value) for value in tensors)
 
 
 @contextmanager
 def outside_transforms() -> Generator[None, None, None]:
-    """Computes as if no transform of `torch.func` were active; of constants alone (`is_transformed`)."""
+    """Suspend the transforms of `torch.func`; only for constants (see `is_transformed`)."""
     if not torch._C._are_functorch_transforms_active():
         yield
         return

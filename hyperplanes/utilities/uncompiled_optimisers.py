@@ -1,7 +1,7 @@
-"""The optimisers of torch.optim without torch._dynamo, which the first of them in a process imports (1.3 to 2 s).
+"""The optimisers of torch.optim without importing torch._dynamo, which takes 1.3 to 2 s in each process.
 
-It is imported to be told that the methods of optimisers are not to be compiled. Nothing here is compiled, so these are
-the same methods without that decoration.
+PyTorch imports it to exclude the methods of optimisers from compilation. Nothing is compiled here, so these are the
+same methods without that decorator.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["SGD", "Adam", "Optimizer"]
 
 
 class Optimizer(_Optimizer):
-    """torch.optim.Optimizer; `step` of a subclass is to be decorated with `torch.no_grad`."""
+    """torch.optim.Optimizer; decorate `step` of subclasses with `torch.no_grad`."""
 
     add_param_group: Any = unwrap(_Optimizer.add_param_group)
     zero_grad: Any = unwrap(_Optimizer.zero_grad)

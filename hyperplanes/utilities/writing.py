@@ -1,4 +1,4 @@
-"""Writing whole files and folders: nobody ever sees half of one, and one process writes into a folder at a time."""
+"""Atomic writing of files and folders, and a lock: one process at a time writes into a folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["WriteError", "one_writer", "write_folder", "write_json", "write_whol
 _unfinished = itertools.count()
 
 UNFINISHED = re.compile(r"\..+\.(\d+)-\d+\.part")
-"""Names of files that are being written, with the number of the process."""
+"""Names of unfinished files, with the process ID."""
 
 
 class WriteError(DataError, OSError):
@@ -29,7 +29,7 @@ class WriteError(DataError, OSError):
     Args:
         path: the file.
         size: of its content in bytes.
-        error: what the operating system said.
+        error: of the operating system.
     """
 
     def __init__(self, path: Path, size: int, error: OSError) -> None:
@@ -40,12 +40,12 @@ class WriteError(DataError, OSError):
 
 
 def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None, *, durable: bool = True) -> None:
-    """Write a file so that nobody ever sees half of it: beside its name first, then renamed.
+    """Write a file atomically: under a temporary name beside it, then renamed.
 
     Args:
-        path: the file; its folder is made when absent.
-        data: all of it.
-        scratch: where the unfinished file lies instead, a folder of the same file system.
+        path: the file; its folder is created if absent.
+        data: its content.
+        scratch: a folder of the same file system for the unfinished file instead.
         durable: wait until it is on the disk, so that it is whole even after a power failure.
 
     Raises:
@@ -65,7 +65,7 @@ def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None
                 os.fsync(file.fileno())
         try:
             os.replace(temporary, path)
-        except FileNotFoundError:  # looking for the folder every time would cost as much as the file
+        except FileNotFoundError:  # checking for the folder each time would cost as much as the file
             path.parent.mkdir(parents=True, exist_ok=True)
             os.replace(temporary, path)
         if durable:
@@ -78,7 +78,7 @@ def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None
 
 
 def _sync_folder(folder: Path) -> None:
-    """Have a rename on the disk too; file systems that cannot open folders do it by themselves."""
+    """Flush a rename to the disk; file systems that cannot open folders do so by themselves."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -89,12 +89,12 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def one_writer(folder: str | Path) -> Generator[None]:
-    """The time in which nobody else may write into a folder, which is made when absent.
+    """A lock on a folder, created if absent, for one writing process at a time.
 
-    The lock belongs to the process: it ends with it, however it ends. A file `.lock` stands in the folder meanwhile.
+    The operating system releases it when the process ends, however it ends. Meanwhile the folder holds a file `.lock`.
 
     Args:
-        folder: to write into.
+        folder: the folder to write into.
 
     Raises:
         DataError: another process at work there, a file in its place, or a folder that cannot be written to.
@@ -114,7 +114,7 @@ def one_writer(folder: str | Path) -> Generator[None]:
             except BaseException:
                 lock.close()
                 raise
-            lock.close()  # of a writer that has just finished and taken its file away
+            lock.close()  # a writer has just finished and removed its file
     except BlockingIOError as error:
         remedy = "wait for it, or name another folder"
         raise DataError(folder, "a folder of its own", "another hyperplanes at work there", remedy) from error
@@ -133,9 +133,9 @@ def one_writer(folder: str | Path) -> Generator[None]:
 
 
 def _delete_unfinished(folder: Path) -> None:
-    """Delete what killed processes have left half written in a folder, and in those in it that nobody has locked."""
+    """Delete unfinished files of killed processes in a folder and in its subfolders that are not locked."""
     for place in (folder, *(child for child in folder.iterdir() if child.is_dir() and not child.is_symlink())):
-        with suppress(PermissionError):  # a folder that is not ours, such as lost+found
+        with suppress(PermissionError):  # a folder of another user, such as lost+found
             if place != folder and (place / ".lock").exists():
                 continue
             for path in place.glob(".*.part"):
@@ -156,7 +156,7 @@ def _is_running(process: int) -> bool:
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Write a JSON file, whole or not at all; infinity and what is not a number, which JSON has not, become null."""
+    """Write a JSON file atomically; infinities and NaN, which JSON lacks, become null."""
     write_whole(path, encode_json(_finite(value)))
 
 
@@ -169,12 +169,14 @@ def _finite(value: object) -> object:
 
 
 def write_folder(folder: str | Path, files: dict[str, bytes], scratch: str | Path) -> None:
-    """Write a folder of files so that nobody ever sees half of it; a rename a file takes twice as long as writing it.
+    """Write a folder of files atomically.
+
+    The folder is renamed once: renaming each file would take twice as long as writing it.
 
     Args:
-        folder: the folder; where it exists already, its files are replaced one by one.
+        folder: the folder; if it already exists, its files are replaced one by one.
         files: content by name inside the folder.
-        scratch: a folder of the same file system, where it lies until it is whole.
+        scratch: a folder of the same file system for the unfinished folder.
 
     Raises:
         WriteError: no space, no permission, or another failure of the operating system.

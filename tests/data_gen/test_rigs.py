@@ -1,6 +1,7 @@
 """Source of truth: Kornia's projection, the stated spread of cameras, hand-made numbers, and what is refused."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,14 +49,14 @@ def test_convention_origin_at_principal_point_and_up_is_up(rig):
     pixels = _kornia_project(rig, np.array([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]]))
     np.testing.assert_allclose(pixels[:, 0], 31.5, atol=1e-9)
     assert (pixels[:, 1, 1] <= pixels[:, 0, 1] + 1e-9).all()
-    np.testing.assert_allclose(np.linalg.norm(rig.camera_centres, axis=1), 3.0)
+    np.testing.assert_allclose(np.linalg.norm(rig.world_from_camera[:, :3, 3], axis=1), 3.0)
     assert (rig.near, rig.far) == (2.0, 4.0)
 
 
 @pytest.mark.parametrize("distance", [1.5, 3.0, 8.0])
 def test_unit_sphere_fits_with_a_margin(distance):
     # The silhouette of the unit sphere is the cone of half angle asin(1 / distance) around the axis.
-    rig = rigs.fixed(1, (60, 40), distance=distance)
+    rig = rigs.fixed(1, 40, distance=distance)
     radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(1.0 / distance))
     assert 0.90 * 20 < radius < 0.97 * 20
 
@@ -68,8 +69,8 @@ def test_the_spiral_of_srn():
     preset = rigs.RIG_PRESETS["srn"]
     rig = rigs.make_rig("srn", 251, 128, distance=preset.distance, field_of_view=preset.field_of_view)
     assert rig.intrinsics[0, 0, 0] == pytest.approx(131.25)
-    x, y, z = (rig.camera_centres / 2).T
-    np.testing.assert_allclose(np.linalg.norm(rig.camera_centres, axis=1) / 2, 1.3)
+    x, y, z = (rig.world_from_camera[:, :3, 3] / 2).T
+    np.testing.assert_allclose(np.linalg.norm(rig.world_from_camera[:, :3, 3], axis=1) / 2, 1.3)
     steps = np.arange(251) * 20 / 250
     np.testing.assert_allclose(y, 1.3 * np.sin(np.pi * steps / 40), atol=1e-12)
     turned = np.unwrap(np.arctan2(x, z)[:-1])  # the last one stands at the pole
@@ -79,7 +80,7 @@ def test_the_spiral_of_srn():
 def test_fixed_is_the_same_every_time_and_spread():
     rig, again = rigs.fixed(50, 32), rigs.fixed(50, 32)
     assert np.array_equal(rig.world_from_camera, again.world_from_camera)
-    directions = rig.camera_centres / 3.0
+    directions = rig.world_from_camera[:, :3, 3] / 3.0
     # Caps of 15 degrees around 50 points, and of 29 around 25, cover about the same share of the band.
     assert _nearest(directions).min() > 15.0
     assert _nearest(directions[0::2]).min() > 29.0
@@ -90,24 +91,24 @@ def test_fixed_is_the_same_every_time_and_spread():
 
 
 def test_fixed_first_views_of_each_half_are_far_apart():
-    directions = rigs.fixed(50, 32).camera_centres / 3.0
+    directions = rigs.fixed(50, 32).world_from_camera[:, :3, 3] / 3.0
     assert _nearest(directions[0:10:2]).min() > 60.0
     assert _nearest(directions[1:11:2]).min() > 60.0
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 50, 51])
 def test_fixed_any_number_of_views(views):
-    centres = rigs.fixed(views, 16).camera_centres
+    centres = rigs.fixed(views, 16).world_from_camera[:, :3, 3]
     assert len(np.unique(centres.round(6), axis=0)) == views
 
 
 def test_random_rigs_follow_their_seed_and_cover_their_part_of_the_sphere():
-    one = rigs.random(400, 8, seed=3).camera_centres
-    assert np.array_equal(one, rigs.random(400, 8, seed=3).camera_centres)
-    assert not np.array_equal(one, rigs.random(400, 8, seed=4).camera_centres)
+    one = rigs.random(400, 8, seed=3).world_from_camera[:, :3, 3]
+    assert np.array_equal(one, rigs.random(400, 8, seed=3).world_from_camera[:, :3, 3])
+    assert not np.array_equal(one, rigs.random(400, 8, seed=4).world_from_camera[:, :3, 3])
     # Uniform on the sphere: each coordinate of the mean of 400 has standard deviation sqrt(1 / 3 / 400) = 0.029.
     assert np.abs((one / 3.0).mean(axis=0)).max() < 0.12
-    upper = rigs.random(400, 8, seed=3, lowest=0.0).camera_centres / 3.0
+    upper = rigs.random(400, 8, seed=3, lowest=0.0).world_from_camera[:, :3, 3] / 3.0
     assert upper[:, 1].min() >= 0.0
     assert abs(upper[:, 1].mean() - 0.5) < 0.05
 
@@ -129,13 +130,13 @@ def test_presets():
 
 
 def test_poses_are_those_of_the_cameras_of_hyperplanes():
-    rig = rigs.fixed(6, (20, 10))
+    rig = replace(rigs.fixed(6, 10), width=20)
     part = rig.cameras([4, 0])
     assert camera.image_size(part) == (10, 20)
-    expected = look_at(torch.from_numpy(rig.camera_centres[[4, 0]]))
+    expected = look_at(torch.from_numpy(rig.world_from_camera[[4, 0], :3, 3]))
     assert torch.allclose(camera.camera_from_world(part), expected, atol=1e-12)
     assert torch.equal(camera.intrinsics(part), torch.from_numpy(rig.intrinsics[[4, 0]]))
-    assert np.allclose(camera.centres(part).numpy(), rig.camera_centres[[4, 0]], atol=1e-12)
+    assert np.allclose(camera.centres(part).numpy(), rig.world_from_camera[[4, 0], :3, 3], atol=1e-12)
 
 
 def test_straight_above_and_below_the_origin_the_image_top_is_the_same_axis():
@@ -157,8 +158,7 @@ def test_one_intrinsic_matrix_serves_all_views():
         (lambda: rigs.fixed(4, 0), "at least 1 pixel, received 0"),
         (lambda: rigs.fixed(4, 16, distance=1.0), "more than 1.04 .* received 1.0"),
         (lambda: rigs.fixed(4, 16, distance=math.inf), "distance: expected a finite number .* received inf"),
-        (lambda: rigs.fixed(4, 16, lowest=50.0, highest=20.0), "received 50.0 and 20.0"),
-        (lambda: rigs.random(4, 16, seed=0, lowest=-91.0), "received -91.0 and 90.0"),
+        (lambda: rigs.random(4, 16, seed=0, lowest=-91.0), "received -91.0"),
         (lambda: rigs.fixed(4, 16, field_of_view=180.0), "received 180.0"),
         (lambda: rigs.orbit(4, 16, elevation=91.0), "received 91.0"),
         (lambda: Rig(np.eye(4), np.eye(3), 4, 4, 1, 2), r"received \(4, 4\)"),

@@ -17,6 +17,7 @@ from hyperplanes.export.mesh import Surface, density_grid, extract_mesh, save_me
 from hyperplanes.export.mesh_filling import fill_hidden
 from hyperplanes.export.mesh_level import Agreement, agreement, choose_level
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import DistortedCamera, distorted
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering.renderer import RayMarching
@@ -219,6 +220,17 @@ def test_an_orbit_after_close_ups_stands_back_until_the_object_fits(distance, mo
     assert float(pixels.max()) < 47
 
 
+def test_an_orbit_through_a_lens_stands_where_views_without_masks_put_it(tmp_path):
+    bare = views()
+    lens = distorted(bare.cameras, torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0]))
+    seen = Views(bare.images, lens, torch.ones(6, 1, 16, 16), bounds=BOUNDS)
+    orbit = orbit_cameras(seen, 4)
+    assert isinstance(orbit, DistortedCamera)
+    assert torch.equal(orbit.distortion, lens.distortion[:4])
+    assert torch.equal(orbit.extrinsics, orbit_cameras(bare, 4).extrinsics)
+    save_turntable(ball(), seen, tmp_path / "turn.webp", frames=2)
+
+
 @pytest.mark.parametrize("kind", ["webp", "gif"])
 def test_a_turntable_moves(kind, tmp_path):
     path = save_turntable(ball(), views(), tmp_path / f"turn.{kind}", frames=5, size=24)
@@ -237,6 +249,10 @@ def test_images_are_written_as_they_are(tmp_path):
     images = torch.rand(3, 3, 4, 5)
     paths = save_images(images, tmp_path / "new", ("a/x.png", "a/y.png", "b/z"))
     assert [path.name for path in paths] == ["x.png", "y.png", "z.png"]
+    assert [path.name for path in save_images(images[:2], tmp_path, ("t_0.25", "t_0.50"))] == [
+        "t_0.25.png",
+        "t_0.50.png",
+    ]
     with Image.open(paths[1]) as image:
         np.testing.assert_array_equal(np.asarray(image), to_pixels(images)[1])
     assert [path.name for path in save_images(images, tmp_path, ("a/x.png", "b/x.png", "c"))][0] == "0000.png"

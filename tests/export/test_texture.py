@@ -113,6 +113,8 @@ def test_a_view_fades_out_towards_a_border_that_cuts_the_object(field, monkeypat
 
 def test_the_file_opens_with_normals_texture_and_an_unlit_material(mesh, tmp_path):
     # Source of truth: trimesh's reader, and the JSON part of the file as glTF 2.0 defines it.
+    with pytest.raises(ValueError, match="expected a name that ends in glb, got 'ply'"):
+        save_textured(mesh, tmp_path / "ball.ply")
     path = save_textured(mesh, tmp_path / "ball.glb")
     loaded = next(iter(trimesh.load_scene(path).geometry.values()))
     assert np.allclose(loaded.vertices, mesh.vertices, atol=1e-5)

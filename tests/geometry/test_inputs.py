@@ -72,6 +72,7 @@ WRONG = [
     (lambda p, m, i: cameras.look_at(p, up=(0.0, 0.0, 0.0)), "up: expected a direction"),
     (lambda p, m, i: cameras.look_at(p * math.nan), "eyes: expected finite positions"),
     (lambda p, m, i: cameras.look_at(p, target=tuple(p[2].tolist())), "eyes: expected every eye away from the target"),
+    (lambda p, m, i: cameras.fibonacci_sphere(4, 1.0, -2.0, 2.0), "lowest, highest: expected -1 <= lowest <="),
 ]
 
 

@@ -39,6 +39,7 @@ def test_tasks_planes_and_fields_have_a_line_and_pictures():
     planes = ImagePlanes(views.images, views.cameras)
     assert repr(planes) == "ImagePlanes(4 of 16x16, 3 channels, cpu)"
     assert len(pictures(planes._repr_html_())) == 4
+    assert pictures(ImagePlanes(views.images[:, :0], views.cameras)._repr_html_()) == []
     field = small_model().adapt(views)
     assert repr(field).startswith("AdaptedField(MLPField(PointMultiPlaneNeRF, ")
     assert len(repr(field)) < 200

@@ -12,7 +12,8 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from hyperplanes.geometry import cameras, sample
 from hyperplanes.geometry.lookup import _INSTALLED, lookup
-from hyperplanes.geometry.packed_images import pack, unpack
+from hyperplanes.geometry.packed_images import pack
+from tests import reference
 
 BACKENDS = ["torch", "cpu"]
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
@@ -166,7 +167,7 @@ def test_packed_images_are_sampled_as_the_images_they_hold(eight_bits):
     packed = pack(images)
     assert packed.bits == (8 if eight_bits else 11)
     results = []
-    for kept, source in ((packed, images), (None, unpack(packed))):
+    for kept, source in ((packed, images), (None, reference.unpack(packed))):
         leaf = coordinates.clone().requires_grad_()
         found = sample(source, leaf, packed=kept)
         results.append((found, torch.autograd.grad(found.square().sum(), leaf)[0]))

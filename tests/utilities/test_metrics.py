@@ -95,7 +95,14 @@ def test_the_foreground_psnr_counts_pixels_of_the_mask_alone():
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("measure", [psnr, ssim])
+@pytest.mark.parametrize("measure", [psnr, ssim, pooled_psnr])
 def test_pictures_of_different_shapes_are_refused(measure):
     with pytest.raises(ValueError, match=r"predicted: expected the shape of the truth, \(2, 3, 12, 12\), got \(1,"):
         measure(torch.rand(1, 3, 12, 12), torch.rand(2, 3, 12, 12))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("shape", [(1, 1, 12, 12), (2, 1, 24, 24)])
+def test_masks_of_other_shapes_are_refused(shape):
+    with pytest.raises(ValueError, match=r"masks: expected one an image, \(2, 1, 12, 12\), got"):
+        foreground_psnr(torch.rand(2, 3, 12, 12), torch.rand(2, 3, 12, 12), torch.ones(shape))

@@ -236,6 +236,17 @@ def test_a_file_that_is_no_experiment_is_refused(text, words, tmp_path):
     assert "\n" not in str(caught.value)
 
 
+def test_a_list_is_a_tuple_where_there_may_be_none():
+    @dataclass(frozen=True)
+    class Weights:
+        values: tuple[float, ...] | None = None
+
+    assert structure(Weights, {"values": [1, 2.5]}) == Weights((1.0, 2.5))
+    assert structure(Weights, {"values": None}) == Weights()
+    with pytest.raises(SettingsError, match="values: expected a tuple of float or None, got a tuple of 1.0, 'a'"):
+        structure(Weights, {"values": [1, "a"]})
+
+
 def test_structures_are_nested_and_named_by_their_path():
     @dataclass(frozen=True)
     class Refusing:

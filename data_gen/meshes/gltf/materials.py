@@ -31,7 +31,7 @@ _SLOTS = ("baseColorTexture", "metallicRoughnessTexture", "normalTexture", "occl
 _GLOSSINESS_FACTORS = ("specularFactor", "glossinessFactor", "diffuseFactor")
 _GLOSSINESS_SLOTS = ("diffuseTexture", "specularGlossinessTexture")
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
-"""How textures go on, by the numbers that samplers have."""
+"""Wrap modes by glTF sampler constant."""
 
 _CLEAREST = 0.1
 
@@ -128,7 +128,7 @@ class _Textures:
         return self._images[not_negative(source)]
 
     def wrap(self, values: dict[str, Any], slot: str) -> tuple[Wrap, Wrap]:
-        """How the texture in a slot goes on outside [0, 1], along u and along v."""
+        """Wrap mode of the texture in a slot along u and along v."""
         texture = self._texture(values, slot)
         if texture is None or "sampler" not in texture:
             return "repeat", "repeat"

@@ -113,7 +113,7 @@ def _material(stated: dict[str, Any], material: PBRMaterial, second: bool, tree:
 
 
 def _wrapped(reference: dict[str, Any], wrap: tuple[Wrap, Wrap], tree: dict[str, Any]) -> dict[str, Any]:
-    """A reference to a texture that goes on outside [0, 1] as drawn; glTF's default is to repeat."""
+    """A reference to a texture with a wrap mode; glTF's default is to repeat."""
     if wrap == ("repeat", "repeat"):
         return reference
     codes = {kind: code for code, kind in WRAPS.items()}

@@ -1,4 +1,4 @@
-"""Compile the kernels that fields are rendered with, so that the first picture need not: `scripts/setup` does it."""
+"""Compile the rendering kernels before the first picture needs them; `scripts/setup` runs this."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ RENDERING = {
     "first_hits.first_hits": "",
     "footprints.footprints": "",
 }
-"""Names of kernels, and what they take as points; those of layers are the processor's."""
+"""Names of kernels, and what they take as points; kernels of layers depend on the processor."""
 
 
 def rendering_kernels() -> dict[str, str]:
-    """As RENDERING, with the kernels of layers that are used on this processor."""
+    """RENDERING and the kernels of layers that this processor uses."""
     modules = {layers_module(), layers_module(mixed_precision=True)} - {None}
     return {**RENDERING, **{f"{module}.layers": "" for module in modules}}
 

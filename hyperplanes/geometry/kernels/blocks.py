@@ -1,8 +1,8 @@
 """Projection of a block of points onto one plane, and its gradient, as numba functions vectorised over the block.
 
 A block is BLOCK points on one plane. Its numbers lie in one scratch array, one row of BLOCK values a quantity (the
-constants below), small enough for the first-level cache. All functions compute in the dtype of the scratch. Reading the
-plane is the matter of `interpolation`.
+constants below), small enough for the first-level cache. All functions compute in the dtype of the scratch. The plane
+is read in `interpolation`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numba import njit
 
 from hyperplanes.geometry.kernels.compiling import FASTMATH
 from hyperplanes.geometry.kernels.llvm import load, read, store
+from hyperplanes.geometry.kernels.memory import BLOCK
 from hyperplanes.geometry.lookup_torch import BORDER
 
 __all__ = [
@@ -30,7 +31,6 @@ __all__ = [
     "unnormalize",
 ]
 
-BLOCK = 128
 # Rows of the scratch: pixel before clamping; 1 / z, zero behind the camera; clamped pixel; whether it is inside the
 # image; gradients with respect to the pixel; coordinates in [-1, 1], or in the backward pass their gradients; the upper
 # left one of the four pixels to interpolate, and the fractions of a pixel beyond it.
@@ -40,11 +40,11 @@ RAW_U, RAW_V, RECIPROCAL, U, V, INSIDE, GRAD_U, GRAD_V, COLUMN, ROW, CORNER, ACR
 # Two rows of four numbers a point; three channels' slopes across and down; the channels, one row each.
 TILE, SLOPES, CHANNELS = BLOCK * 13, BLOCK * 21, BLOCK * 27
 
-# Everything that a kernel calls is inlined into it. A function of a point would take less time than its call; and what
+# Everything that a kernel calls is inlined into it. A function of one point takes less time than its call; and what
 # numba does not inline becomes a weak symbol, which the loader resolves to the copy of whichever kernel was compiled or
 # loaded first: the last bit of a result would then depend on what ran before.
 inlined = njit(fastmath=FASTMATH, error_model="numpy", nogil=True, forceinline=True)
-# Products and sums are fused as they are written, and not reordered: planes and interleaved pixels give the same bits.
+# Products and sums are fused as written and not reordered: planes and interleaved pixels give the same bits.
 blended = njit(fastmath={"contract"}, error_model="numpy", nogil=True, forceinline=True)
 
 
@@ -140,7 +140,7 @@ def _unnormalize(s, count, values, at, step, apart, height, width):
 def unnormalize(s, count, values, at, by, height, width):
     """Coordinates in [-1, 1] from `at` on, `by` (point, view, axis) apart -> clamped U, V; INSIDE.
 
-    Lanes without a point keep what they held. Comparisons are written so that NaN becomes 0.
+    Lanes without a point keep their values. Comparisons are written so that NaN becomes 0.
     """
     if by[0] == 2 and by[2] == 1 and count == BLOCK:  # pairs of adjacent numbers: strides known to the compiler
         _unnormalize(s, BLOCK, values, at, 2, 1, height, width)
@@ -175,7 +175,7 @@ def back_project(s, points, at, pitch, matrices, view, gradients, sums):
     for i in range(BLOCK):
         x, y, z = load(points, at + i), load(points, at + pitch + i), load(points, at + 2 * pitch + i)
         reciprocal = load(s, RECIPROCAL + i)
-        # Clamped pixels differ from those before clamping, also where these are NaN, and are always finite.
+        # Clamped pixels differ from unclamped ones, also where these are NaN, and are always finite.
         u, v, front = load(s, U + i), load(s, V + i), reciprocal > zero
         h0 = load(s, GRAD_U + i) * reciprocal if front & (load(s, RAW_U + i) == u) else zero
         h1 = load(s, GRAD_V + i) * reciprocal if front & (load(s, RAW_V + i) == v) else zero

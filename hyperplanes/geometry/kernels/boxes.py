@@ -1,4 +1,4 @@
-"""Which samples of a ray may lie in a box around all occupied voxels; most of the scene's sphere lies beside it."""
+"""Which samples of a ray may lie in the box around all occupied voxels, which is often far smaller than the scene."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def samples_within(origins, directions, first, far, ray, step, box):
         if slope != 0:
             enters = max(enters, min(low / slope, high / slope))
             leaves = min(leaves, max(low / slope, high / slope))
-        elif low > 0 or high < 0:  # it goes beside the box
+        elif low > 0 or high < 0:  # it misses the box
             leaves = first[ray]
-    if not enters <= far[ray]:  # behind the end of the ray, or no number
+    if not enters <= far[ray]:  # beyond the end of the ray, or NaN
         enters = far[ray]
     return np.int64(max(enters - first[ray], first.dtype.type(0)) / step), min(leaves, far[ray])

@@ -1,6 +1,6 @@
-"""The CPU kernel of the visual hull: LANES voxels at once, view after view, until masks have ruled all of them out.
+"""The CPU kernel of the visual hull: LANES voxels at once, view after view, until all of them are ruled out.
 
-The arithmetic is that of `occupancy._carve_torch` on LANES voxels along z, as loops that LLVM vectorises: 7 ms in place
+The arithmetic is that of `occupancy._carve_torch` on LANES voxels along z, as loops that LLVM vectorises: 7 ms instead
 of 180 on one thread for 64 voxels an axis and 25 masks of 64x64.
 """
 
@@ -21,7 +21,7 @@ LANES = 16
 @inlined
 @no_type_check
 def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius, min_z):
-    """Counts down the votes left in the lanes of `alive` that one view rules out; returns how many are left in all."""
+    """Decrements the votes in the lanes of `alive` that one view rules out; returns the sum of all votes left."""
     rows, stride = np.int32(tables.shape[1]), np.int32(tables.shape[2])
     number = alive.dtype.type
     zero, half, one = number(0), number(0.5), number(1)
@@ -49,7 +49,7 @@ def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius
         extent_v = per_row * extent_down + half
         left, right, top, low = u - extent_u, u + extent_u, v - extent_v, v + extent_v
         judged = front & (left >= -half) & (top >= -half) & (right <= right_most) & (low <= lowest)
-        # The box of pixels, with its first row and column left out; nothing where the picture does not hold it.
+        # The box of pixels, without its first row and column; skipped unless the picture contains all of it.
         first, last = np.int32(left + half if judged else zero), np.int32(right + half if judged else zero)
         upper, lower = np.int32(top + half if judged else zero), np.int32(low + half if judged else zero)
         last, lower = np.int32(min(last, stride - 2) + 1), np.int32(min(lower, rows - 2) + 1)
@@ -68,7 +68,7 @@ def _judge(alive, tables, view, matrix, calibration, x, y, bottom, voxel, radius
 @inlined
 @no_type_check
 def fill_lanes(alive, occupied, i, j, begin, count, value):
-    """Writes a value into the lanes of the first `count` voxels that are occupied, 0 into others; how many are so."""
+    """Writes a value into the lanes of occupied voxels among the first `count`, 0 into others; returns their number."""
     given = 0
     for k in range(LANES):
         left = occupied[i, j, begin + k] if k < count else 0
@@ -81,10 +81,10 @@ def fill_lanes(alive, occupied, i, j, begin, count, value):
 def carve(matrices, calibrations, tables, corner, voxel, radius, min_z, votes, occupied, start, stop):
     """Clears the voxels in layers start..stop of `occupied` that `occupancy.carve` describes as ruled out.
 
-    Voxels that are clear from the start are not looked at.
+    Voxels that are clear from the start are skipped.
 
     `tables` (view, row + 1, column + 1) count the set pixels above and left; `corner` is where voxel (0, 0, 0) starts;
-    `votes` so many views have to rule a voxel out.
+    `votes` is the number of views that must rule a voxel out.
     """
     alive, half, planes, last = np.empty(LANES, corner.dtype), corner.dtype.type(0.5), tables.shape[0], 0
     for i in range(start, stop):

@@ -1,4 +1,4 @@
-"""Shapes, types and indices that the kernels rely on: they read memory without looking whether it is theirs."""
+"""Checks of shapes, types and indices, since the kernels access memory without bounds checks."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _MOST_PIXELS = 2**31  # the kernels count an image's pixels in 32 bits
 def check_lookup(
     points: Tensor, matrices: Tensor, images: Tensor, packed: Tensor | None, bits: int, views: Tensor | None
 ) -> None:
-    """Check that a lookup's kernels stay inside these tensors.
+    """Check that the kernels of lookup stay inside these tensors.
 
     Raises:
-        ValueError: a shape, type or index that they would leave them by.
+        ValueError: a shape, type or index with which they would not.
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points: expected shape (point, 3), got {tuple(points.shape)}")
@@ -43,7 +43,7 @@ def check_sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bit
     """Check that the kernels of sampling stay inside these tensors.
 
     Raises:
-        ValueError: a shape or type that they would leave them by.
+        ValueError: a shape or type with which they would not.
     """
     if coordinates.ndim != 3 or coordinates.shape[1:] != (len(images), 2):
         raise ValueError(
@@ -54,7 +54,7 @@ def check_sample(images: Tensor, coordinates: Tensor, packed: Tensor | None, bit
 
 
 def check_gradient(name: str, gradient: Tensor | None, shape: tuple[int, ...], like: Tensor) -> None:
-    """Check that an incoming gradient is that of a result of this shape.
+    """Check that an incoming gradient has the shape of its result.
 
     Raises:
         ValueError: another shape or type.

@@ -24,17 +24,17 @@ from hyperplanes.utilities.environment import cache_folder, has_amx, has_bfloat1
 
 __all__ = ["FASTMATH", "compile_function", "compile_kernel", "layers_module"]
 
-FASTMATH = {"contract", "reassoc", "arcp", "nsz"}  # all flags but those that assume neither NaN nor infinity
+FASTMATH = {"contract", "reassoc", "arcp", "nsz"}  # all but the flags that assume no NaN and no infinity
 
 ROOM = 2**21
-"""Bytes that the machine code of all kernels takes, about."""
+"""Approximate size of the machine code of all kernels, in bytes."""
 
 LLVM_OF_BFLOAT16 = (20, 0, 0)
-"""The first version that was tried and compiles bfloat16; 15 leaves a call of a function of AMX that there is not."""
+"""The first LLVM version tried that compiles bfloat16; 15 leaves a call of an AMX function that does not exist."""
 
 _STRIDED = "T[::1], UniTuple(int64, 3)"  # a tensor of three dimensions as its memory and strides
 _POINTS = "T[::1], int64, T[:, :, ::1], none, none"  # points, their pitch, matrices
-_COORDINATES = f"none, int64, none, {_STRIDED}"  # nothing, their pitch, nothing, coordinates
+_COORDINATES = f"none, int64, none, {_STRIDED}"  # none, their pitch, none, coordinates
 _IMAGES = "T[:, :, :, ::1], uint32[::1], int64, int64, int64"  # planes, the same packed, bits, height, width
 _SIGNATURES = {  # by module and function, without those of points; T is the dtype
     "lookup_forward.forward": f"{_IMAGES}, T, T, T[::1], T[::1], uint8[::1], boolean, int64[:, ::1]",
@@ -71,16 +71,15 @@ _SIGNATURES = {  # by module and function, without those of points; T is the dty
 
 @functools.cache
 def layers_module(*, mixed_precision: bool = False) -> str | None:
-    """The module of this folder whose kernel multiplies layers faster than PyTorch does on this processor.
+    """The module of this folder whose layer kernel is faster than PyTorch on this processor.
 
     Args:
-        mixed_precision: whether it may round the factors of products to bfloat16.
+        mixed_precision: whether factors may be rounded to bfloat16.
 
     Returns:
-        "layers_amx", "layers_amx_bfloat16", "layers_bfloat16" or "layers", for AMX, for AVX-512's instructions for
-        bfloat16 and for AVX-512 alone; None without these or numba. Compilers before LLVM 20, and numba where the
-        environment says what processor it compiles for or forbids AVX, do not know the instructions of all but the
-        last.
+        "layers_amx" or "layers_amx_bfloat16" for AMX, "layers_bfloat16" for AVX-512's bfloat16 instructions, "layers"
+        for AVX-512 alone; None without these or numba. All but the last need LLVM 20, and an environment that neither
+        sets numba's target processor nor forbids AVX.
     """
     if not find_spec("numba"):
         return None
@@ -96,7 +95,7 @@ def layers_module(*, mixed_precision: bool = False) -> str | None:
             return "layers_bfloat16"
     try:
         return "layers" if get_host_cpu_features().get("avx512f") else None
-    except RuntimeError:  # a processor that LLVM does not know
+    except RuntimeError:  # a processor unknown to LLVM
         return None
 
 
@@ -120,7 +119,7 @@ def compile_kernel(name: str, dtype: torch.dtype, points: str = "") -> Callable[
 def compile_function(function: Callable[..., Any], signature: str | None = None) -> Callable[..., Any]:
     """A function compiled by numba, which releases the interpreter lock when called.
 
-    Threads that ask for it at once compile it once.
+    Several threads that ask for it at once compile it once.
 
     Args:
         function: loops over NumPy arrays.
@@ -161,7 +160,7 @@ if hasattr(os, "register_at_fork"):  # a thread that held it is not in the child
 
 @contextmanager
 def _one_at_a_time(path: Path) -> Generator[None]:
-    """Processes that start together compile each kernel once: the others wait, and find it in the cache."""
+    """Of processes that start together, one compiles each kernel; the others wait and find it in the cache."""
     try:
         import fcntl
     except ImportError:  # Windows: each compiles its own
@@ -175,7 +174,7 @@ def _one_at_a_time(path: Path) -> Generator[None]:
 def _is_private(folder: Path) -> bool:
     """Whether a folder, and no link to one, belongs to this user and others cannot write to it.
 
-    A folder that is this user's and open to others is closed to them.
+    A folder of this user that is open to others is closed to them.
     """
     if not hasattr(os, "getuid"):
         return True  # Windows: the profile's folders are private
@@ -188,7 +187,7 @@ def _is_private(folder: Path) -> bool:
 
 
 def _remove(folder: str, process: int) -> None:
-    """Delete the folder of a process when it ends, not when one that was forked from it does."""
+    """Delete the folder of a process when it ends, but not when a fork of it ends."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -197,11 +196,11 @@ def _remove(folder: str, process: int) -> None:
 def _cache_folder() -> str:
     """The folder of cached machine code.
 
-    Numba notices a change of the file that a function stands in, not of the files of functions it calls: a hash of all
-    sources of this folder is part of the name.
+    Numba notices changes of the file that contains a function, not of the files of functions it calls: the folder's
+    name contains a hash of all sources of this package.
 
-    What numba caches it unpickles, which runs what somebody else might have put there: the folder is this user's alone,
-    and where one of another user stands in its place, or its disk is full, a new one for this process is taken.
+    Numba unpickles its cache, which would run whatever somebody else put there: only this user may write to the folder.
+    Where another user owns it, or the disk is full, this process takes a new folder of its own.
     """
     from numba.core import config
 

@@ -1,7 +1,7 @@
-"""The CPU kernel of `visibility.VisibilityPlanes.describe`: what views show of a point, as rows that a network reads.
+"""The CPU kernel of `visibility.VisibilityPlanes.describe`: what views show of a point, as rows for a network.
 
-Views are judged as by `visibility.choose`; colours are read only in the views that are chosen. A row has the order in
-which the first layer of a network reads it, so that nothing is gathered or concatenated afterwards.
+Views are chosen as by `visibility.choose`; colours are read only in the chosen ones. Rows have the order of the inputs
+of the first layer, so that nothing is gathered or concatenated afterwards.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _interpolate(grid, row, at, x, y, z):
 @inlined
 @no_type_check
 def _describe_best(s, pitch, packed, shape, chosen, numbers, covered, seen, row, at, colours, weights, colour):
-    """Nine numbers of each of the best views, then what all of them have in common; returns where the row goes on."""
+    """Nine numbers of each of the best views, then eleven of all of them; returns where the row goes on."""
     number = s.dtype.type
     zero, one, two = number(0), number(1), number(2)
     total, height, width, slots, bits = shape[0], shape[1], shape[2], shape[3], shape[6]
@@ -176,14 +176,14 @@ def _describe_nearest(s, pitch, packed, shape, chosen, scores, numbers, row, at,
         numbers[16],
         number(LEAST_TURN),
     )
-    for index in range(ranked):  # the angle, and what the view is weighted by
+    for index in range(ranked):  # the angle, and the score that weights the view
         view = chosen[index]
         angle = min(max(load(s, TURN * pitch + view), least_turn), number(math.pi) - least_turn)
         scores[index] = max(angle + by_angle * max(load(s, PENALTY * pitch + view), zero), smallest)
         if index < near:
             row[at + 7 * index + 3] = angle
     farthest = number(1.01) * scores[slots] if total > slots else two * number(1.01) * scores[near - 1]
-    # what is read of a view, as in `_describe_best`: by one function for both the kernel takes 15 to 25 % longer
+    # the numbers of a view, as in `_describe_best`: with one function for both, the kernel takes 15 to 25 % longer
     for index in range(near):
         view = chosen[index]
         valid = load(s, PENALTY * pitch + view) < unseen
@@ -206,7 +206,7 @@ def describe(
     points, directions, cameras, maps, surface, packed, grid, shape, numbers, sphere, rows, coverage, near_rows,
     near_weights, near_colours, start, stop,
 ):  # fmt: skip
-    """Writes what is read of points start..stop.
+    """Writes the network inputs of points start..stop.
 
     Where `rows` (point, number) have columns they get the encoded point; nine numbers of each of the best views; mean,
     variance and difference to the best colour, the least opacity and the logarithm of the number of views; and the
@@ -214,10 +214,10 @@ def describe(
 
     Where there are directions, the rows of `near_rows` get the encoded direction and seven numbers of each of the views
     nearest to it, `near_weights` (point, view) the logarithms of the weights of the unstructured lumigraph, and
-    `near_colours` (point, view, 3) their colours. These views are judged by the `surface` where that is not empty, a
-    map like `maps`.
+    `near_colours` (point, view, 3) their colours. These views are chosen by `surface`, a map like
+    `maps`, unless it is empty.
 
-    `shape` is the number of views, height, width, how many best and nearest views a row has room for, the pitch of
+    `shape` is the number of views, height, width, the numbers of best and nearest views in a row, the pitch of
     `cameras`, the bits of a packed channel, and the frequencies of points and directions; `numbers` are the limits of
     `visibility.choose`, then FADING, FALLOFF and SMALLEST_ANGLE; `sphere` the centre and 1 / radius of the scene. The
     others are as in `visibility.choose`.

@@ -27,13 +27,13 @@ def _direction(lens, rotation, u, v):
 
 @no_type_check
 def first_hits(cameras, pixels, opacity, sphere, step, box, occupied, distances, start, stop):
-    """Writes into `distances` (view, row, column) those of the first samples that lie in an occupied voxel.
+    """Writes the distances of the first samples in an occupied voxel into `distances` (view, row, column).
 
-    Rows start..stop, those of all views one after the other, where `opacity` of a pixel is above 0. Samples lie at
-    near + (i + 1/2) step, before far, which is written where none of them does; near and far are those of `rays.cast`.
+    That is done in rows start..stop, counted through all views, for pixels of `opacity` above 0. Samples lie at
+    near + (i + 1/2) step, before far, which is written where none is in a voxel; near and far are those of `rays.cast`.
     `cameras` are the centre, the rotation from the world row by row, and focal lengths, principal point and skew of
-    each; `pixels` (view, row, column, 2) those without lens distortion, empty where there is none; `sphere` the centre
-    and the radius of the scene, `box` the corners around its occupied voxels.
+    each; `pixels` (view, row, column, 2) the undistorted pixels, empty without distortion; `sphere` the centre and the
+    radius of the scene, `box` the corners around its occupied voxels.
     """
     number = cameras.dtype.type
     zero, half, side, radius = number(0), number(0.5), number(occupied.shape[0]), sphere[3]

@@ -48,7 +48,7 @@ def footprints(points, matrices, calibrations, radius, nearest, seen, start, sto
         if near or (count and (across > width or down > height)):
             seen[view] = True
             continue
-        # how many centres fall into each pixel of a picture with that much beside it, summed along rows and columns
+        # number of centres in each pixel of a picture padded by these, as a summed-area table
         sums = np.zeros((height + 2 * down + 1, width + 2 * across + 1), np.int32)
         for i in range(count):
             sums[places[i, 1] + down + 1, places[i, 0] + across + 1] += 1

@@ -1,4 +1,4 @@
-"""The CPU kernel of `geometry.hull_hits.centres_in_hull`: LANES voxels along z at once, as `carving.carve` has them."""
+"""The CPU kernel of `geometry.hull_hits.centres_in_hull`: LANES voxels along z at once, as in `carving.carve`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["centres"]
 @inlined
 @no_type_check
 def _judge(inside, cameras, view, maps, shape, x, y, bottom, voxel, min_z, opacity):
-    """Clears the lanes of `inside` whose centre one view shows with too little opacity; returns how many are left."""
+    """Clears the lanes of `inside` whose centre one view shows with too little opacity; returns how many remain."""
     number = inside.dtype.type
     zero, half, one = number(0), number(0.5), number(1)
     height, width, pitch = np.int32(shape[1]), np.int32(shape[2]), shape[3]
@@ -32,7 +32,7 @@ def _judge(inside, cameras, view, maps, shape, x, y, bottom, voxel, min_z, opaci
     u1, v1, z1 = cameras[m + 2 * pitch], cameras[m + 6 * pitch], cameras[m + 10 * pitch]
     visible, first, left_over = cameras[15 * pitch + view] > zero, 2 * np.int64(view) * height * width + 1, zero
     for k in range(LANES):
-        # where the centre falls into the view
+        # projection of the centre
         z = bottom + (number(np.int32(k)) + half) * voxel
         camera_z = z0 + z1 * z
         front = visible & (camera_z > min_z)
@@ -74,7 +74,7 @@ def centres(cameras, maps, shape, corner, voxel, limits, occupied, start, stop):
                 bottom = corner[2] + corner.dtype.type(begin) * voxel
                 if fill_lanes(inside, occupied, i, j, begin, count, 1) == 0:
                     continue
-                for turn in range(shape[0]):  # the view that cut the last voxels away often does so with the next ones
+                for turn in range(shape[0]):  # the view that cleared the last voxels often clears the next ones
                     view = last + turn if last + turn < shape[0] else last + turn - shape[0]
                     if _judge(inside, cameras, view, maps, shape, x, y, bottom, voxel, least_z, opacity) == 0:
                         last = view

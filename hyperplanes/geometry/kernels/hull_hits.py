@@ -1,4 +1,4 @@
-"""The CPU kernel of `geometry.hull_hits`: every ray steps on until no mask cuts its sample away."""
+"""The CPU kernel of `geometry.hull_hits`: every ray steps on until no mask rules its sample out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["hull_hits"]
 @inlined
 @no_type_check
 def _opacity(cameras, pitch, view, x, y, z, maps, shape, min_z):
-    """Opacity of the mask where a point falls into a view, bilinear, as `visibility.judge`; 1 where it is not shown."""
+    """Bilinear opacity of a view's mask at a point's projection, as in `visibility.judge`; 1 where it is not shown."""
     number = maps.dtype.type
     zero, one = number(0), number(1)
     height, width = shape[1], shape[2]
@@ -48,8 +48,8 @@ def hull_hits(
 ):
     """Writes into `nearest` the distance of the first sample of rays start..stop in the hull, infinity where none is.
 
-    Samples lie at first + i step, before far, in occupied voxels, as `marching.march` has them. One lies in the hull
-    where every view that shows it has at least an opacity there; the view that cut the last sample away is asked first.
+    Samples lie at first + i step, before far, in occupied voxels, as in `marching.march`. One lies in the hull where
+    every view that shows it has the least opacity there; the view that ruled out the last sample is tested first.
     `cameras` and `maps` are those of `visibility.choose`, `shape` the number of views, height, width and the pitch of
     `cameras`; `limits` are min_z and the opacity, `sphere` the centre and the radius of the scene, `box` the corners
     around its occupied voxels.

@@ -1,9 +1,9 @@
-"""Bilinear values of one plane for one block of points, and their pull-back to the pixels' positions.
+"""Bilinear values of one plane for one block of points, and their gradients with respect to pixel positions.
 
 Numba functions on the scratch of `blocks`, for three layouts of a plane: one channel of numbers; three channels packed
 into 32 bits, (8, 8, 8) or (11, 11, 10), the first one lowest; and pixels of four numbers, the last one unused, with a
 spare pixel at the end. A gather costs as much as its lanes, and takes 12 lanes a lookup from the first layout, 4 from
-the second; the third is read without any, but has to be made first (`interleave`), for many points on one plane.
+the second; the third is read without any, but has to be made first (`interleave`): for many points on one plane.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def _corner(s, i, height, width):
 def _taps(images, offset, k, height, width):
     """The four neighbours from `k` on: the corner, right of it, below it, across.
 
-    Those that an image of one row or column lacks are the corner itself.
+    In an image of one row or column, the corner takes the place of missing neighbours.
     """
     right, below = np.int32(1 if width > 1 else 0), np.int32(width if height > 1 else 0)
     a, b = read(images, offset, k), read(images, offset, np.int32(k + right))
@@ -148,7 +148,7 @@ def pull_packed(s, packed, offset, height, width, bits):
         first = load(s, CHANNELS + i) * inside * unit
         second = load(s, CHANNELS + BLOCK + i) * inside * unit
         third = load(s, CHANNELS + 2 * BLOCK + i) * inside * unit_last
-        # The gradient with respect to a tap is the same sum for each: contract channels first, then interpolate.
+        # All four taps need the same sum over channels: contract channels first, then interpolate.
         g = (first, second, third)
         ga, gb, gc = _contracted(a, g, channels), _contracted(b, g, channels), _contracted(c, g, channels)
         twist = (_contracted(d, g, channels) - gc) - (gb - ga)
@@ -159,7 +159,7 @@ def pull_packed(s, packed, offset, height, width, bits):
 @inlined
 @no_type_check
 def room(images, bits, segments):
-    """Memory for an interleaved plane, or none where segments have too few points for interleaving to pay off."""
+    """Memory for an interleaved plane; empty where segments have too few points for interleaving to pay off."""
     channels, height, width = images.shape[1:]
     points = 0
     for index in range(len(segments)):

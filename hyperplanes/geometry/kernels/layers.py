@@ -1,7 +1,7 @@
 """The CPU kernel of fully connected layers with ReLU: all layers of a block of points, one block after the other.
 
-What a layer writes stays in the caches until the next one reads it. TILE points by COLUMNS values are computed at once,
-in registers: each number of the weights and of the points that is loaded is used several times. The weights of COLUMNS
+The values of a layer stay in the caches until the next one reads them. TILE points by COLUMNS values are computed at
+once, in registers, so that each weight and each input that is loaded is used several times. The weights of COLUMNS
 values lie one input after the other (`pack_weights`).
 """
 
@@ -24,7 +24,7 @@ __all__ = ["BLOCK", "COLUMNS", "TILE", "WIDEST", "copy_block", "layers", "multip
 TILE, VECTORS = 6, 4  # 24 of the 32 registers of AVX-512 hold sums, four weights
 COLUMNS = LANES * VECTORS
 BLOCK = 10 * TILE
-WIDEST = 512  # wider layers are as fast by PyTorch
+WIDEST = 512  # PyTorch is as fast for wider layers
 
 _FUSED = {"flags": ("contract",)}
 
@@ -34,13 +34,13 @@ def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Float[Ten
 
     Args:
         weight: with a multiple of COLUMNS outputs.
-        first: how many of the inputs come first, which makes no difference here.
+        first: number of inputs that come first; not used here.
     """
     return weight.unflatten(0, (-1, COLUMNS)).transpose(1, 2).flatten()
 
 
 def _add_product(builder, total, one, other):
-    """A vector of sums after products of single precision, or of pairs of bfloat16, are added."""
+    """A vector of sums plus products of single precision, or of pairs of bfloat16."""
     if one.type == total.type:
         return builder.fadd(total, builder.fmul(one, other, **_FUSED), **_FUSED)
     pairs = ir.VectorType(BFloat(), 2 * LANES)
@@ -50,10 +50,10 @@ def _add_product(builder, total, one, other):
 
 
 def _sums(builder, sums, values, weights, count):
-    """The sums of TILE times VECTORS vectors, after products of so many inputs and their weights are added.
+    """TILE times VECTORS vectors of sums, plus the products of `count` inputs and their weights.
 
     `values` are pointers to the first input of each point, `weights` one to the first of the weights. An input is a
-    number of single precision, or a pair of bfloat16.
+    number in single precision, or a pair of bfloat16.
     """
     kind, index, loaded = sums[0].type, count.type, ir.VectorType(weights.type.pointee, LANES)
     before = builder.block
@@ -143,7 +143,7 @@ def multiply_tile(  # noqa: PLR0913
 @inlined
 @no_type_check
 def copy_block(given, first, count, block, size):
-    """Numbers of the points from `first` on, `size` apart in `block`; in the order in which they lie in memory."""
+    """Copies the numbers of points from `first` on into `block`, `size` apart, in the order of memory."""
     if given.strides[0] > given.strides[1]:
         for point in range(count):
             for number in range(given.shape[1]):
@@ -159,8 +159,8 @@ def layers(given, weights, biases, shape, out, start, stop):
     """The values of points start..stop after all layers, into `out`.
 
     `given` are the inputs of points, `weights` those of all layers as `pack_weights` makes them, `biases` theirs.
-    `shape` is the number of layers, their width, and the layer that reads the inputs and then the values of the layer
-    before; 0 for none.
+    `shape` is the number of layers, their width, and the layer that reads the inputs before the values of the previous
+    layer; 0 for none.
     """
     depth, width, skip = shape
     size = given.shape[1]
@@ -171,7 +171,7 @@ def layers(given, weights, biases, shape, out, start, stop):
         copy_block(given, first, count, inputs, size)
         read = 0
         for layer in range(depth):
-            one, other = other, one  # `one` is written, `other` read
+            one, other = other, one  # `one` is written, `other` is read
             used, also = size if layer == 0 or layer == skip else 0, width if layer > 0 else 0
             for column in range(0, width, COLUMNS):
                 for point in range(0, count, TILE):

@@ -1,8 +1,8 @@
 """The kernel of `layers` for Intel's AMX, whose instructions multiply tiles of 16 rows in bfloat16.
 
-A number of single precision is the sum of two of bfloat16, but for 2**-17 of it. Of the four products of two such sums
-the three largest are added up, in single precision: values differ from those of single precision by some 1e-5 to 3e-5
-of the largest. Numbers that are infinite, or above 3.38e38, give NaN, and those below 1e-38 count as zero.
+A number in single precision is the sum of two in bfloat16, up to 2**-17 of it. Of the four products of two such sums
+the three largest are added up in single precision: values differ from those in single precision by some 1e-5 to 3e-5 of
+the largest. Numbers that are infinite, or above 3.38e38, give NaN, and those below 1e-38 count as zero.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hyperplanes.geometry.kernels.vectors import LANES, address_of, read_vector,
 
 __all__ = ["COLUMNS", "WIDEST", "layers", "multiply_layers", "pack_weights"]
 
-ROWS = LANES  # of a tile, which are vectors of as many numbers of single precision
+ROWS = LANES  # of a tile, each a vector of as many numbers in single precision
 TILE = COLUMNS = 2 * ROWS  # points and columns of four tiles, and inputs of one product
 BLOCK = 5 * TILE  # points that go through all layers together
 WIDEST = 2048  # no wider layers were measured
@@ -37,19 +37,19 @@ def pack_weights(weight: Float[Tensor, "output input"], first: int, parts: int =
 
     Args:
         weight: with a multiple of TILE outputs.
-        first: how many of the inputs come first, and are filled up with zeros to a multiple of TILE. The number of the
-            others has to be a multiple of it.
-        parts: how many numbers of bfloat16 a weight is the sum of, 1 or 2.
+        first: number of inputs that come first, which are padded with zeros to a multiple of TILE. The number of the
+            others must be a multiple of it.
+        parts: number of bfloat16 summands of a weight, 1 or 2.
     """
     filled = torch.cat([pad(weight[:, :first], (0, -first % TILE)), weight[:, first:]], 1)
-    # blocks of TILE columns, two tiles of columns, and of their inputs pairs side by side
+    # blocks of TILE columns in two tiles, with pairs of inputs side by side
     tiles = filled.reshape(len(weight) // TILE, 2, ROWS, -1, ROWS, 2).permute(0, 3, 1, 4, 2, 5)
     high = tiles.bfloat16()
     return torch.stack([high, (tiles - high).bfloat16()][:parts], 2).flatten().view(torch.int16)
 
 
 def _call(builder, name, *arguments):
-    """An instruction on tile registers: those are given by number."""
+    """An instruction on tile registers, which are given by their numbers."""
     numbers = [ir.Constant(_BYTE, each) if isinstance(each, int) else each for each in arguments]
     kind = ir.FunctionType(ir.VoidType(), [each.type for each in numbers])
     builder.call(builder.module.declare_intrinsic(f"llvm.x86.{name}", (), kind), numbers)
@@ -57,7 +57,7 @@ def _call(builder, name, *arguments):
 
 @intrinsic
 def _configure(typing_context, shapes):
-    """Take the tile registers into use, with the shapes that the processor's manual describes."""
+    """Configure the tile registers with shapes as the processor's manual describes them."""
 
     def generate(context, builder, signature, arguments):
         _call(builder, "ldtilecfg", address_of(context, builder, signature.args[0], arguments[0]))
@@ -68,7 +68,7 @@ def _configure(typing_context, shapes):
 
 @intrinsic
 def _release(typing_context):
-    """Give the tile registers back."""
+    """Release the tile registers."""
 
     def generate(context, builder, signature, arguments):
         _call(builder, "tilerelease")
@@ -79,13 +79,13 @@ def _release(typing_context):
 
 @intrinsic
 def _begin(typing_context, biases, bias):
-    """TILE points by TILE columns, tiles 0 to 3, become the biases of these columns."""
+    """Fill tiles 0 to 3, TILE points by TILE columns, with the biases of the columns."""
 
     def generate(context, builder, signature, arguments):
         address = address_of(context, builder, signature.args[0], *arguments)
         for tile in range(4):
             column = builder.gep(address, [_LONG(tile % 2 * ROWS * 4)])
-            _call(builder, "tileloadd64", tile, column, _LONG(0))  # every row the same
+            _call(builder, "tileloadd64", tile, column, _LONG(0))  # the same row for all
         return context.get_dummy_value()
 
     return types.void(biases, types.int64), generate
@@ -194,7 +194,7 @@ def _activate(typing_context, numbers, at, out, place):
 @inlined
 @no_type_check
 def multiply_layers(given, weights, biases, shape, out, start, stop, parts):  # noqa: PLR0913
-    """The kernel with factors that are the sums of two numbers of bfloat16, or with one part alone."""
+    """The kernel, with factors that are sums of two numbers in bfloat16, or one number alone."""
     depth, width, skip = shape
     size = (given.shape[1] + TILE - 1) // TILE * TILE
     inputs = np.zeros(BLOCK * parts * size, np.int16)
@@ -217,7 +217,7 @@ def multiply_layers(given, weights, biases, shape, out, start, stop, parts):  # 
                 _round(values, number, inputs, at)
         read = 0
         for layer in range(depth):
-            one, other = other, one  # `one` is written, `other` read
+            one, other = other, one  # `one` is written, `other` is read
             used, also = size if layer == 0 or layer == skip else 0, width if layer > 0 else 0
             for column in range(0, width, TILE):
                 for point in range(0, count, TILE):

@@ -1,7 +1,7 @@
 """The kernel of `layers` in mixed precision: products of bfloat16 by AVX-512, added up in single precision.
 
-Numbers between layers, and weights, are rounded to bfloat16: values differ from those of single precision by some 0.1
-to 1 % of the largest. Numbers below 1e-38 count as zero.
+Weights and the values between layers are rounded to bfloat16: results differ from single precision by some 0.1 to 1 %
+of the largest. Numbers below 1e-38 count as zero.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Int32[Ten
 
     Args:
         weight: with a multiple of COLUMNS outputs.
-        first: how many of the inputs come first, and are filled up with a zero to an even number. The number of the
-            others has to be even.
+        first: number of inputs that come first, which are padded with a zero to an even number. The number of the
+            others must be even.
     """
     filled = torch.cat([pad(weight[:, :first], (0, first % 2)), weight[:, first:]], 1)
     pairs = filled.bfloat16().reshape(len(weight) // COLUMNS, COLUMNS, -1, 2).transpose(1, 2)
@@ -45,7 +45,7 @@ def layers(given, weights, biases, shape, out, start, stop):
     """
     depth, width, skip = shape
     size, half = (given.shape[1] + 1) // 2, width // 2  # pairs of a point
-    # the last vector that is rounded may begin at the last number
+    # the last rounded vector may begin at the last number
     values, last = np.zeros(BLOCK * 2 * size + LANES, np.float32), np.zeros(BLOCK * width, np.float32)
     inputs = np.zeros(BLOCK * size + LANES // 2, np.int32)
     one, other = np.zeros(BLOCK * half, np.int32), np.zeros(BLOCK * half, np.int32)
@@ -56,7 +56,7 @@ def layers(given, weights, biases, shape, out, start, stop):
             _round(values, number, inputs, number // 2)
         read = 0
         for layer in range(depth):
-            one, other = other, one  # `one` is written, `other` read
+            one, other = other, one  # `one` is written, `other` is read
             used, also = size if layer == 0 or layer == skip else 0, half if layer > 0 else 0
             for column in range(0, width, COLUMNS):
                 for point in range(0, count, TILE):

@@ -1,6 +1,6 @@
 """The backward loops of lookup and sampling on the CPU; see `lookup_forward` for how work and memory are laid out.
 
-Incoming gradients have whatever strides autograd gives them. They come as flat memory with the strides of (point, view,
+Incoming gradients have any strides. They are passed as flat memory with the strides of (point, view,
 channel) as a tuple; where the stride of points is 1, as for gradients laid out like the results, LLVM reads whole
 vectors.
 """
@@ -85,7 +85,7 @@ def backward(points, pitch, matrices, given, by, images, packed, bits, height, w
 @no_type_check
 def image_backward(points, pitch, matrices, given, by, height, width, min_z, grad_colours, per, channels, pixel,
                    grad_images, segments):  # fmt: skip
-    """Gradients with respect to the planes of the segments, of which no two threads may share one.
+    """Gradients with respect to the planes of the segments; no two threads may share a plane.
 
     `grad_images` is flat (view, row, column, channel), `pixel` numbers a pixel, with one spare pixel at the end, since
     an image one pixel wide has zero weight on a neighbour that it lacks.

@@ -6,7 +6,7 @@ that the last block may be written whole. One plane after the other is sampled a
 then stay in the cache, interleaved first where the segment is long enough.
 
 Points are rows of x, y and z with the planes' projection matrices, or, where these are None, coordinates in [-1, 1] in
-memory of any strides (point, view, axis). Each kernel is compiled for both, without the branches of a None.
+memory of any strides (point, view, axis). Each kernel is compiled for both, without branches on None.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def locate(s, points, pitch, matrices, given, by, view, p, count, height, width,
 @no_type_check
 def forward(points, pitch, matrices, given, by, images, packed, bits, height, width, background, min_z, colours,
             coordinates, valid, grouped, segments):  # fmt: skip
-    """Colours of all segments; coordinates and validity too of projected points.
+    """Colours of all segments; for projected points also coordinates and validity.
 
     Where the points are `grouped` by view, the results have no dimension of views.
     """
@@ -52,7 +52,7 @@ def forward(points, pitch, matrices, given, by, images, packed, bits, height, wi
     s, pixels = scratch(images.dtype, 0), room(images, bits, segments)
     for index in range(len(segments)):
         view, begin, end = segments[index, 0], segments[index, 1], segments[index, 2]
-        row = 0 if grouped else view * pitch  # of results of one number a point
+        row = 0 if grouped else view * pitch  # in results of one number a point
         if len(pixels):
             interleave(images, view, pixels)
         for p in range(begin, end, BLOCK):

@@ -1,7 +1,7 @@
 """The fused lookup for CUDA devices, in Triton: one program a block of points, all planes in a loop.
 
-The fused lookup of the CPU and its gradient, for CUDA. Points, matrices and images stay in their own layouts;
-results are planar, (view, channel, point), so that a warp writes whole lines. Gradients with respect to images and
+Lookup and gradient are those of the CPU kernels. Points, matrices and images keep their layouts; results are planar,
+(view, channel, point), so that a warp writes whole lines. Gradients with respect to images and
 matrices are summed by atomics, so their last digits may differ from run to run.
 """
 

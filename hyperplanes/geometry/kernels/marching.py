@@ -1,4 +1,4 @@
-"""The CPU kernel of `rendering.marching.march`: every ray steps through the grid, and occupied voxels are noted."""
+"""The CPU kernel of `rendering.marching.march`: every ray steps through the grid and records samples in voxels."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ __all__ = ["march"]
 
 @no_type_check
 def march(origins, directions, first, far, step, sphere, box, occupied, ray, distances, found, start, stop):
-    """Writes the samples of rays start..stop in occupied voxels, ray after ray, and into found[0] their number.
+    """Writes the samples of rays start..stop in occupied voxels, ray after ray, and their number into found[0].
 
     Samples lie at first + i step, before far. `sphere` is the centre and the radius of the scene, `box` the corners
     around its occupied voxels. `ray` gets the index of the ray of each sample, `distances` its distance; both have room
-    for all of them.
+    for all samples.
     """
     number = first.dtype.type
     side, half, one = occupied.shape[0], number(occupied.shape[0]) / number(2), number(1)

@@ -1,4 +1,4 @@
-"""Tensors as the CPU kernels take and give them: NumPy arrays, flat memory, rows of whole blocks."""
+"""Memory layouts of the CPU kernels: NumPy arrays, flat memory, rows of whole blocks."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ __all__ = [
     "uninitialised",
 ]
 
-BLOCK = 128  # points that the kernels take at once; `blocks.BLOCK`, which needs numba to import
+BLOCK = 128  # points that a kernel processes at once
 
 
 def pitch(points: Tensor) -> int:
-    """How long a row of one number a point is: on the CPU whole blocks of the kernels."""
+    """Length of a row with one number a point: on the CPU, whole blocks of the kernels."""
     return -(-len(points) // BLOCK) * BLOCK if points.device.type == "cpu" else len(points)
 
 
 def pixel_pitch(channels: int) -> int:
-    """Numbers that a pixel's gradient takes in memory: three channels are padded to a vector of four."""
+    """Numbers per pixel of an image gradient: three channels are padded to a vector of four."""
     return 4 if channels == 3 else channels
 
 
@@ -42,34 +42,34 @@ def uninitialised(like: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> T
 
 
 def flat(value: Tensor) -> np.ndarray:
-    """The memory that a tensor lies in, room to spare included."""
+    """The whole storage of a tensor, including unused memory."""
     return value.new_empty(0).set_(value.untyped_storage()).numpy()
 
 
 def strided(value: Tensor) -> tuple[np.ndarray, tuple[int, ...]]:
-    """The memory that a tensor spans, from its first element on, and its strides."""
+    """The memory from a tensor's first to its last element, and its strides."""
     span = 1 + sum((size - 1) * stride for size, stride in zip(value.shape, value.stride(), strict=True))
     return value.detach().as_strided((span if value.numel() else 0,), (1,)).numpy(), value.stride()
 
 
 def array(tensor: Tensor) -> np.ndarray:
-    """A tensor's numbers, without gaps."""
+    """A tensor as a contiguous NumPy array."""
     return tensor.detach().contiguous().numpy()
 
 
 def number(like: Tensor) -> type[np.floating[Any]]:
-    """The scalar type that goes with a tensor."""
+    """The NumPy scalar type of a tensor."""
     return np.float64 if like.dtype == torch.float64 else np.float32
 
 
 def planes(images: Tensor, packed: Tensor | None, bits: int) -> tuple[Any, ...]:
-    """Images, the same packed or nothing, bits a channel or 0, height and width."""
+    """Images, the same packed or an empty array, bits per channel or 0, height and width."""
     words = np.zeros(0, np.uint32) if packed is None else array(packed).reshape(-1).view(np.uint32)
     return array(images), words, bits if packed is not None else 0, images.shape[2], images.shape[3]
 
 
 def pixel_gradient(images: Tensor) -> tuple[np.ndarray, Tensor]:
-    """Zeros for the gradient of images as the kernels fill it, and the same memory as (view, channel, row, column).
+    """Zeros for the gradient of images in the layout of the kernels, and a view of it as (view, channel, row, column).
 
     Pixels lie side by side in memory, their channels padded to `pixel_pitch`, with one spare pixel at the end.
     """

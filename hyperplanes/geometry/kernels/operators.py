@@ -1,8 +1,8 @@
 """Lookup and sampling as PyTorch operators, `hyperplanes::lookup` and `hyperplanes::sample`, with their gradients.
 
-Registered with `torch.library`, so that autograd, `torch.compile` and fake tensors know them. This file holds shapes
-and autograd for all device types, and how the CPU calls its kernels; `lookup_triton` has those for CUDA, which has no
-kernel of sampling alone. A gradient that is itself to be differentiated is computed in plain PyTorch.
+Registered with `torch.library` for autograd, `torch.compile` and fake tensors. This file holds shapes
+and autograd for all device types, and the calls of the CPU kernels; `lookup_triton` has those for CUDA, which has no
+kernel for sampling alone. A gradient that is itself to be differentiated is computed in plain PyTorch.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 
 __all__ = ["lookup", "lookup_backward", "sample", "sample_backward"]
 
-_CHUNK = 64 * memory.BLOCK  # points in one call of a kernel
+_CHUNK = 64 * memory.BLOCK  # points per kernel call
 _PLANES = "Tensor points, Tensor matrices, Tensor images, Tensor? packed, int bits, Tensor? views, float nearest"
 _SAMPLED = "Tensor images, Tensor coordinates, Tensor? packed, int bits"
 _GRADIENTS = "Tensor? grad_colours, Tensor? grad_coordinates, bool geometry, bool pixels"
@@ -45,13 +45,13 @@ def _operator(name: str, schema: str) -> Callable[[Callable[..., Any]], Any]:
 
 @dataclass(frozen=True)
 class _Points:
-    """The points of a kernel's call, and which of them fall on which plane.
+    """The points of a kernel call, and the planes of each.
 
     Attributes:
         kind: "projected" or "given".
         arguments: points as rows of x, y and z, the length of a row, matrices; coordinates and their strides.
         like: a tensor of the dtype to compute in.
-        total: number of points on each plane, or, where every point has planes of its own, length of a row.
+        total: number of points on each plane, or the length of a row where every point has its own planes.
         groups: segments (view, begin, end) of the points grouped by plane; None where all points fall on all planes.
         position: place of each (point, slot) among the grouped points.
     """
@@ -82,13 +82,13 @@ class _Points:
         return cls("given", arguments, coordinates, len(coordinates))
 
     def run(self, kernel: Callable[[np.ndarray], Any], planes: int, whole_planes: bool, packed: bool = False) -> list:
-        """The kernel on all segments, by all threads; `whole_planes` where no two may write to one plane."""
+        """Run the kernel on all segments in all threads; `whole_planes` where no two threads may write to one plane."""
         if (groups := self.groups) is not None:
             step = -(-max(1, len(groups)) // (torch.get_num_threads() * (1 if whole_planes else 4)))
             return parallel_for(lambda start, stop: kernel(groups[start:stop]), len(groups), step)
         if whole_planes:
             return parallel_for(lambda start, stop: kernel(_segments(start, stop, 0, self.total)), planes, 1)
-        # An equal part for each thread gains from planes interleaved for it; packed planes are never interleaved.
+        # Equal parts, each with its own interleaved planes, are faster; packed planes are never interleaved.
         equal = -(-self.total // (torch.get_num_threads() * memory.BLOCK)) * memory.BLOCK
         chunk = _CHUNK if packed else max(_CHUNK, equal)
         return parallel_for(lambda start, stop: kernel(_segments(0, planes, start, stop)), self.total, chunk)
@@ -103,7 +103,7 @@ class _Points:
 
 
 def _rows(points: Tensor, pitch: int) -> np.ndarray:
-    """Points as rows of x, y and z; by NumPy, since PyTorch's threads take longer to start than this."""
+    """Points as rows of x, y and z; by NumPy, since starting PyTorch's threads would take longer."""
     rows = np.zeros((3, pitch), memory.number(points))
     rows[:, : len(points)] = points.detach().numpy().T
     return rows
@@ -116,7 +116,7 @@ def _segments(first: int, last: int, begin: int, end: int) -> np.ndarray:
 
 
 def _grouped(views: np.ndarray, planes: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Segments of points sorted by plane, each from a whole block on; the place of each point; the length of a row."""
+    """Segments of points sorted by plane, each starting a new block; the place of each point; the length of a row."""
     order, count = np.argsort(views, kind="stable"), np.bincount(views, minlength=planes)
     padded = -(-count // memory.BLOCK) * memory.BLOCK
     begin = padded.cumsum() - padded

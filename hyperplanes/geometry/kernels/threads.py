@@ -1,8 +1,8 @@
-"""Work for several threads: ranges of compiled kernels, and parts of a computation in PyTorch.
+"""Parallel work in threads: ranges of compiled kernels, and parts of a computation in PyTorch.
 
 Both release the interpreter lock, so pools of Python threads run them in parallel: they survive a fork (the child
-starts new ones), may be used from several threads at once, and follow `torch.set_num_threads`, none of which holds for
-numba's own threading layers.
+starts new ones), may be used from several threads at once, and follow `torch.set_num_threads`; numba's own
+threading layers do none of this.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 Other = TypeVar("Other")
 
 _pools: dict[tuple[int, str], ThreadPoolExecutor] = {}
-_single: dict[int, ThreadPoolExecutor] = {}  # whose threads run operations of PyTorch alone
+_single: dict[int, ThreadPoolExecutor] = {}  # their threads run each PyTorch operation on one thread
 _making = Lock()
 _second = Lock()  # held while `at_once` runs two computations
 
@@ -33,7 +33,7 @@ def parallel_for(work: Callable[[int, int], Result], total: int, chunk: int) -> 
     The calling thread is one of them.
 
     Args:
-        work: releases the interpreter lock where it takes long.
+        work: releases the interpreter lock during long computations.
         total: length of the range.
         chunk: length of the part that one call works on.
 
@@ -56,12 +56,12 @@ def parallel_for(work: Callable[[int, int], Result], total: int, chunk: int) -> 
 def parallel_map(work: Callable[[Part], Result], parts: Sequence[Part]) -> Iterator[Result]:
     """The results of work(part), in order, without gradients, by `torch.get_num_threads()` threads on the CPU.
 
-    Each thread runs the operations of PyTorch alone: OpenMP's threads would wait for each other after each operation,
-    and parts are waited for once. What a part computes depends on the part, not on the number of threads.
+    Each operation of PyTorch runs on one thread: OpenMP's threads would wait for each other after each operation, these
+    threads only at the end. The result of a part does not depend on the number of threads.
 
     Args:
-        work: may be called from several threads at once, and does not build on gradients or autocast.
-        parts: of the work, each long enough that starting it takes no time by comparison (a millisecond).
+        work: may be called from several threads at once, and needs neither gradients nor autocast.
+        parts: of the work, each long enough (a millisecond) for its start to be negligible.
 
     Yields:
         The result of each part.
@@ -74,7 +74,7 @@ def parallel_map(work: Callable[[Part], Result], parts: Sequence[Part]) -> Itera
         yield from map(work, parts)
         return
 
-    @torch.no_grad()  # as all such settings one of the thread
+    @torch.no_grad()  # a setting of each thread
     def run(part: Part) -> Result:
         return work(part)
 
@@ -88,9 +88,9 @@ def parallel_map(work: Callable[[Part], Result], parts: Sequence[Part]) -> Itera
 
 
 def side_by_side(work: Callable[[Part], Result], parts: Sequence[Part], device: torch.device) -> list[Result]:
-    """The results of a few long parts, in order, as `parallel_map` where no thread is left idle by it.
+    """The results of a few long parts, in order, by `parallel_map` where that keeps all threads busy.
 
-    On another device than the CPU, and with more threads than parts, one part follows the other and takes all threads.
+    On other devices, and with more threads than parts, the parts run one after the other on all threads.
 
     Args:
         work: as in `parallel_map`.
@@ -105,13 +105,13 @@ def side_by_side(work: Callable[[Part], Result], parts: Sequence[Part], device: 
 def at_once(one: Callable[[], Result], other: Callable[[], Other], device: torch.device) -> tuple[Result, Other]:
     """The results of two computations in several steps each, whose parts `parallel_map` runs; without gradients.
 
-    While one of them waits for its last part, or does what no thread shares, parts of the other run. On another device
-    than the CPU, with one thread, and where two such computations run already, one follows the other. An error in one
-    is raised when the other has ended, too.
+    While one of them waits for its last part, or runs what is not parallel, parts of the other run. On other devices,
+    with one thread, and where two such computations run already, they run one after the other. An error in one is
+    raised when the other has ended, too.
 
     Args:
-        one: as the work of `parallel_map`; run by the calling thread.
-        other: likewise; run by another one.
+        one: like the work of `parallel_map`; run by the calling thread.
+        other: likewise; run by another thread.
         device: where both are done.
     """
     threads = torch.get_num_threads()
@@ -119,9 +119,9 @@ def at_once(one: Callable[[], Result], other: Callable[[], Other], device: torch
     if alone or not _second.acquire(blocking=False):
         return one(), other()
 
-    @torch.no_grad()  # as all such settings one of the thread
+    @torch.no_grad()  # a setting of each thread
     def beside() -> Other:
-        torch.get_num_threads()  # a thread that has not asked yet takes the number of all, later
+        torch.get_num_threads()  # or the thread would take the global number at its first operation
         torch.set_num_threads(threads)
         return other()
 
@@ -143,13 +143,13 @@ def _single_pool(size: int) -> ThreadPoolExecutor:
             for _ in range(size):
                 pool.submit(started.wait)
             started.wait()
-            torch.set_num_threads(torch.get_num_threads())  # threads to come take the number that was set last
+            torch.set_num_threads(torch.get_num_threads())  # new threads take the number that was set last
             _single[size] = pool
         return _single[size]
 
 
 def _run_operations_alone() -> None:
-    torch.get_num_threads()  # a thread that has not asked yet takes the number of all, later
+    torch.get_num_threads()  # or the thread would take the global number at its first operation
     torch.set_num_threads(1)
 
 

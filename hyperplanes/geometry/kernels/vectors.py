@@ -1,4 +1,4 @@
-"""Vectors of numbers in the kernels of layers, and the type bfloat16 (numba only)."""
+"""Vectors and bfloat16 numbers for the kernels of layers (numba only)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from numba.extending import intrinsic
 
 __all__ = ["LANES", "BFloat", "address_of", "read_vector", "rounded", "rounding", "write_vector"]
 
-LANES = 16  # numbers of single precision in a vector of AVX-512
+LANES = 16  # numbers in single precision per AVX-512 vector
 
 
 class BFloat(ir.Type):
-    """The type bfloat of LLVM, which llvmlite does not know."""
+    """LLVM's type bfloat, which llvmlite lacks."""
 
     def _to_string(self):
         return "bfloat"
@@ -32,14 +32,14 @@ def rounded(builder, value):
 
 
 def address_of(context, builder, kind, array, offset=None):
-    """Of an element of an array, as bytes."""
+    """The address of an element of an array, as a pointer to bytes."""
     data = context.make_array(kind)(context, builder, array).data
     place = data if offset is None else builder.gep(data, [offset])
     return builder.bitcast(place, ir.IntType(8).as_pointer())
 
 
 def read_vector(context, builder, kind, array, at, least=None):
-    """LANES numbers of an array from `at` on, or `least` where that is more; NaN stays."""
+    """LANES numbers of an array from `at` on, at least `least`; NaN stays."""
     floats = ir.VectorType(ir.FloatType(), LANES)
     address = address_of(context, builder, kind, array, at)
     value = builder.load(builder.bitcast(address, floats.as_pointer()), align=4)
@@ -56,7 +56,7 @@ def write_vector(context, builder, kind, array, at, value):
 
 
 def rounding(least):
-    """A function of kernels that rounds numbers to bfloat16, after those below `least`, if any, have become it."""
+    """A function for kernels that raises numbers to at least `least`, if given, and rounds them to bfloat16."""
 
     @intrinsic
     def round_vector(typing_context, numbers, at, out, place):

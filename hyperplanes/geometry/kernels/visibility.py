@@ -1,7 +1,7 @@
-"""The CPU kernel of `visibility.VisibilityPlanes.choose`: every view of a point is judged, the best few are kept.
+"""The CPU kernel of `visibility.VisibilityPlanes.choose`: the penalty of every view of a point, and the best views.
 
-The views of a point are judged at once, in loops that LLVM vectorises. Their numbers lie in one scratch array, one row
-of `pitch` values a quantity (the constants below).
+All views of a point are computed at once, in loops that LLVM vectorises. Their numbers lie in one scratch array, one
+row of `pitch` values a quantity (the constants below).
 """
 
 from __future__ import annotations
@@ -93,12 +93,12 @@ def judge(s, pitch, total, cameras, maps, shape, limits):
         a, b = read(maps, 1, at), read(maps, 1, below)
         a, b = a + across * (read(maps, 1, right) - a), b + across * (read(maps, 1, beyond) - b)
         opacity = a + down * (b - a)
-        # how far behind the surface the point lies, in radii, and what that costs
+        # depth of the point behind the surface, in radii, and its penalty
         shown = load(s, SHOWN * pitch + k) > zero
         behind = (load(s, DISTANCE * pitch + k) - depth) * per_unit
         penalty = min(max(steep * (behind - tolerance), lowest), deepest)
         penalty = min(penalty + (partly if opacity < whole else zero), highest) + read(cameras, 16 * pitch, k)
-        # in the margin of a border that cuts the object: more and more towards it
+        # in the margin of a border that crops the object: rising towards it
         cut = per_pixel * load(s, INSIDE * pitch + k)
         penalty = max(penalty, zero) + halfway * cut / (end - cut) if cut > zero else penalty
         store(s, BEHIND * pitch + k, behind if shown else zero)
@@ -127,7 +127,7 @@ def _acos(x):
 @inlined
 @no_type_check
 def rank(s, pitch, total, along_x, along_y, along_z, by_angle):
-    """The score of each view by its direction: the angle to another one, and by how much it counts, the penalty."""
+    """The score of each view: the angle between its ray and a direction, plus its weighted penalty."""
     number = s.dtype.type
     zero, one = number(0), number(1)
     for k in range(total):
@@ -142,7 +142,7 @@ def rank(s, pitch, total, along_x, along_y, along_z, by_angle):
 def least(s, pitch, total, row, count, views, scores, start):
     """Writes the `count` views of the least numbers in a row of the scratch, best first, from `start` on.
 
-    Where all numbers are NaN, as those of a point that is not finite, these are the first views.
+    If all numbers are NaN, as for a point that is not finite, the first views are taken.
     """
     for place in range(count):
         scores[place], views[start + place] = np.inf, place
@@ -172,7 +172,7 @@ def choose(
     """Writes the chosen views of points start..stop. All arrays are flat.
 
     `cameras` holds 21 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
-    matrix, 0 where it is hidden, its handicap, and the pixels of its margins. `maps` (view, row, column, 2) hold depth
+    matrix, 0 where it is masked, its handicap, and the pixels of its margins. `maps` (view, row, column, 2) hold depth
     and opacity. `shape` is the number of views, height, width, the numbers of chosen views, and the pitch; `limits`
     min_z, 1 / radius, the tolerance, deepest and partly of `chosen_views.Penalties`, WHOLE, UNSEEN, ANGLE, steep,
     highest, least, 1 / the pixels of a margin, CUT and BEYOND. `best` and `near` (point, chosen) get indices of views,
@@ -185,7 +185,7 @@ def choose(
     s, scores = np.empty(ROWS * pitch, limits.dtype), np.empty(max(best_count, near_count, 1), limits.dtype)
     for point in range(start, stop):
         at = 3 * point
-        # what each view shows of the point
+        # depth, opacity and penalty of each view
         place(s, pitch, total, points[at], points[at + 1], points[at + 2], cameras, shape, limits[0])
         judge(s, pitch, total, cameras, maps, shape, limits)
         # over all views: least opacity, and how many show it

@@ -1,4 +1,4 @@
-"""Loops over rays through a sparse voxel grid (numba only): their pixels, and the gradient of a squared error of these.
+"""Loops over rays through a sparse voxel grid (numba only): pixels, and the gradient of their squared error.
 
 Positions are in cells: cell (i, j, k) lies between the centres of voxels i and i + 1, and so on; the whole part of a
 position is the index of its cell, the fraction the place between the voxel centres. `index` has the row of each voxel,
@@ -17,9 +17,9 @@ from hyperplanes.geometry.kernels.blocks import inlined
 
 __all__ = ["add_gradients", "render", "shade"]
 
-MAX_SAMPLES = 1024  # of positive density on a ray whose gradient is computed
+MAX_SAMPLES = 1024  # samples of positive density on a ray whose gradient is computed
 HARMONICS = 9
-NUMBERS = 1 + 3 * HARMONICS  # of a voxel: loops of a constant length are unrolled and vectorised
+NUMBERS = 1 + 3 * HARMONICS  # per voxel; loops of constant length are unrolled and vectorised
 
 
 @inlined
@@ -38,7 +38,7 @@ def _corner(index, cell_x, cell_y, cell_z, x, y, z, corner):
 @inlined
 @no_type_check
 def _inside(empty, origin, along, first, last, step):
-    """The first sample of a ray in the box of all cells, and the t at which it leaves it; none where it is beside."""
+    """The first sample of a ray in the box of all cells, and the t at which the ray leaves it; none if it misses."""
     enter, zero = first, np.float32(0.0)
     for axis in range(3):
         if along[axis] != zero:
@@ -46,7 +46,7 @@ def _inside(empty, origin, along, first, last, step):
             enter, last = max(enter, min(near, far)), min(last, max(near, far))
         elif origin[axis] < zero or origin[axis] > np.float32(empty.shape[axis]):
             return 0, first
-    if not enter <= last:  # where a ray is nearly parallel to an axis, `enter` may be no number of samples
+    if not enter <= last:  # for a ray nearly parallel to an axis, `enter` may not be finite
         return 0, first
     return int(math.ceil((enter - first) / step)), last
 
@@ -57,7 +57,7 @@ def _next_cell(empty, origin, along, first, last, step, per_cell, sample):
     """The first sample from `sample` on in a cell that is not empty.
 
     Returns:
-        The sample after it, its t, and its position; no t is below `last` where the ray ends first.
+        The index after it, its t, and its position; t is not below `last` where the ray ends first.
     """
     while True:
         t = first + np.float32(sample) * step
@@ -65,7 +65,7 @@ def _next_cell(empty, origin, along, first, last, step, per_cell, sample):
         if t >= last:
             return sample, t, x, y, z
         cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
-        if min(cell_x, cell_y, cell_z) < 0:  # by rounding, as the box is entered or left
+        if min(cell_x, cell_y, cell_z) < 0:  # by rounding, where the ray enters or leaves the box
             sample += 1
             continue
         if cell_x >= empty.shape[0] or cell_y >= empty.shape[1] or cell_z >= empty.shape[2]:
@@ -84,7 +84,7 @@ def _next_sample(index, values, empty, origin, along, first, last, step, per_cel
     """The first sample from `sample` on whose density is positive.
 
     Returns:
-        The sample after it; its position and density, which is zero where the ray ends first. `mixed` receives the
+        The index after it; its position and density, which is zero where the ray ends first. `mixed` receives the
         interpolated coefficients, weighted by density.
     """
     zero = np.float32(0.0)
@@ -124,7 +124,7 @@ def _colour(basis, ray, mixed, density):
 @inlined
 @no_type_check
 def _composite(transmittance, added, r, g, b, red, green, blue, opacity):  # noqa: PLR0913
-    """The weight of a sample in its pixel, the transmittance behind it, and the sums up to it (NeRF, Eq. 3)."""
+    """The weight of a sample in its pixel, the transmittance behind it, and the sums including it (NeRF, Eq. 3)."""
     one, zero = np.float32(1.0), np.float32(0.0)
     behind = transmittance * math.exp(-added)
     weight = transmittance - behind
@@ -172,7 +172,7 @@ def _interpolated(index, shaded, x, y, z):
     x, y, z = x - np.float32(cell_x), y - np.float32(cell_y), z - np.float32(cell_z)
     density = r = g = b = np.float32(0.0)
     for corner in range(8):
-        # Without a branch for voxels that have no row: -1 is the last one, of zeros.
+        # No branch for voxels without a row: -1 is the last row, of zeros.
         row, weight = _corner(index, cell_x, cell_y, cell_z, x, y, z, corner)
         density += weight * shaded[row, 0]
         r += weight * shaded[row, 1]
@@ -183,10 +183,10 @@ def _interpolated(index, shaded, x, y, z):
 
 @no_type_check
 def render(index, shaded, empty, origins, directions, near, far, step, stopped, background, out, start, stop):  # noqa: PLR0913
-    """The pixels of rays start..stop through voxels that `shade` made ready: (colour, opacity, depth) into `out`.
+    """The pixels of rays start..stop through voxels from `shade`: (colour, opacity, depth) into `out`.
 
     Returns:
-        The samples of positive density.
+        The number of samples of positive density.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     total = 0
@@ -230,7 +230,7 @@ def add_gradients(  # noqa: PLR0913
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     mixed = np.empty(NUMBERS, np.float32)
-    by_number = np.zeros(NUMBERS, np.float32)  # of a sample, by its interpolated numbers; density has its own way
+    by_number = np.zeros(NUMBERS, np.float32)  # gradient by a sample's interpolated numbers, but density
     most = 1  # rays of a pixel
     for pixel in range(start, stop):
         most = max(most, pixels[pixel + 1] - pixels[pixel])
@@ -270,7 +270,7 @@ def add_gradients(  # noqa: PLR0913
             counts[place], behind[place] = count, transmittance
             shown = (one - opacity) * background
             red, green, blue = red + shown, green + shown, blue + shown
-        # The difference of their mean from the truth, and the derivative of its square by each ray.
+        # The error of their mean, and the derivative of its square with respect to each ray.
         share = one / np.float32(rays)
         wrong_r, wrong_g, wrong_b = (
             red * share - truth[pixel, 0],
@@ -304,7 +304,7 @@ def add_gradients(  # noqa: PLR0913
                     by_number[1 + HARMONICS + number] = of_basis * by_green
                     by_number[1 + 2 * HARMONICS + number] = of_basis * by_blue
                 mean = by_red * r + by_green * g + by_blue * b
-                # The share of each voxel around the sample in its density and its colour.
+                # The contribution of each surrounding voxel to density and colour.
                 x, y, z = places[place, kept, 0], places[place, kept, 1], places[place, kept, 2]
                 cell_x, cell_y, cell_z = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
                 x, y, z = x - np.float32(cell_x), y - np.float32(cell_y), z - np.float32(cell_z)

@@ -3,17 +3,15 @@
 import os
 import signal
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 from hyperplanes.utilities.files import DataError
 
 
-@contextmanager
 def serve(settings):
     if settings.get("broken"):
         raise RuntimeError("no renderer here")
-    yield lambda item: perform(item, Path(settings["folder"]))
+    return lambda item: perform(item, Path(settings["folder"]))
 
 
 def perform(item, folder):

@@ -2,19 +2,21 @@
 
 import resource
 import signal
-from contextlib import contextmanager
 
 from data_gen.datasets import objects
 
 
-@contextmanager
 def open_renderer(settings):
-    with objects.open_renderer(settings) as process:
+    process = objects.open_renderer(settings)
+
+    def limited(item):
         soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
         ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (1024, hard))
         try:
-            yield process
+            return process(item)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
             signal.signal(signal.SIGXFSZ, ignored)
+
+    return limited

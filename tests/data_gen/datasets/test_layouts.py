@@ -101,7 +101,7 @@ def test_learnits_loader_finds_what_it_reads(tmp_path):
         picture = folder / (frame["file_path"].split("/")[-1] + ".png")
         assert np.array_equal(np.array(Image.open(picture)), original.rgba[index])
         pose = np.array(frame["transform_matrix"])
-        assert np.allclose(pose[:3, 3], original.rig.camera_centres[index])
+        assert np.allclose(pose[:3, 3], original.rig.world_from_camera[index, :3, 3])
         assert np.allclose(-pose[:3, 2], original.rig.world_from_camera[index, :3, 2]), "OpenGL looks along -z"
     focal = 0.5 * 20 / np.tan(0.5 * document["camera_angle_x"])
     assert np.isclose(focal, original.rig.intrinsics[0, 0, 0])
@@ -145,7 +145,7 @@ def test_the_authors_own_files_are_read_without_our_additions(tmp_path):
     ]
     legacy = catalogue(tmp_path, {}, legacy=True).read("car-00000").support
     assert camera.intrinsics(legacy.cameras)[0, :2, 2].tolist() == [100.0, 100.0]
-    centres = original.rig.camera_centres  # the first half, as the authors' code splits them
+    centres = original.rig.world_from_camera[:, :3, 3]  # the first half, as the authors' code splits them
     assert np.allclose(camera.centres(views.cameras), centres[: VIEWS // 2], atol=1e-5)
     opened = open_dataset(tmp_path, legacy=True).task("car-00000").query
     assert camera.intrinsics(opened.cameras)[0, :2, 2].tolist() == [100.0, 100.0]
@@ -164,7 +164,7 @@ def test_learnits_own_files_are_split_as_its_notebook_does_and_missing_objects_a
     for legacy, centre in ((False, 9.5), (True, 10.0)):  # 20 pixels: W / 2 at integer pixel centres, or the middle
         task = open_datasets([tmp_path], legacy=legacy).task("car_00000")
         for views, part in ((task.support, slice(0, VIEWS // 2)), (task.query, slice(VIEWS // 2, None))):
-            assert np.allclose(camera.centres(views.cameras), original.rig.camera_centres[part], atol=1e-5)
+            assert np.allclose(camera.centres(views.cameras), original.rig.world_from_camera[part, :3, 3], atol=1e-5)
             assert camera.intrinsics(views.cameras)[0, :2, 2].tolist() == pytest.approx([centre, centre])
     assert main(["evaluate", "--method", "nearest_view", "--data", str(tmp_path), "--legacy"]) == 0
     (line,) = capsys.readouterr().err.strip().splitlines()
@@ -184,7 +184,7 @@ def test_srns_loader_finds_what_it_reads(tmp_path):
     assert lines[-1] == "20 20"
     pose = np.loadtxt(folder / "pose/000002.txt").reshape(4, 4)
     assert np.allclose(pose[:3, :3], original.rig.world_from_camera[2, :3, :3])
-    assert np.allclose(pose[:3, 3], original.rig.camera_centres[2] / 2)
+    assert np.allclose(pose[:3, 3], original.rig.world_from_camera[2, :3, 3] / 2)
     assert original.rig.near / 2 >= 0.8 - 1e-9
     assert original.rig.far / 2 <= 1.8 + 1e-9
     assert len(read_task(folder).support) == 3
@@ -195,7 +195,7 @@ def test_srns_loader_finds_what_it_reads(tmp_path):
 def test_pixel_nerfs_planes_lose_nothing_of_an_object_in_srns_layout(class_name, near, far):
     """Its loader: z_near, z_far = 1.25, 2.75 where "chair" is in the path of the data set, else 0.8 and 1.8."""
     rig = rendered("srn", Item("a", class_name, "train", seed=1)).rig
-    depths = np.linalg.norm(rig.camera_centres, axis=1) * LAYOUTS["srn"].scale
+    depths = np.linalg.norm(rig.world_from_camera[:, :3, 3], axis=1) * LAYOUTS["srn"].scale
     assert (depths - 0.5 >= near - 1e-9).all()
     assert (depths + 0.5 <= far + 1e-9).all()
 
@@ -243,4 +243,6 @@ def test_a_native_object_is_a_nerfstudio_scene(tmp_path):
     assert document["train_filenames"] == [f"images/{index:03d}.png" for index in (0, 2, 4)]
     assert (document["near"], document["far"]) == (2.0, 4.0)
     assert np.isclose(document["fl_x"], fixed(2, 20).intrinsics[0, 0, 0])
-    assert np.allclose(np.array(document["frames"][1]["transform_matrix"])[:3, 3], original.rig.camera_centres[1])
+    assert np.allclose(
+        np.array(document["frames"][1]["transform_matrix"])[:3, 3], original.rig.world_from_camera[1, :3, 3]
+    )

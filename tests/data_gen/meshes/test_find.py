@@ -53,6 +53,11 @@ def test_other_folders_hold_other_objects(tmp_path):
     assert sorted(taken(touch(tmp_path, *names))) == sorted(names)
 
 
+def test_a_dot_within_a_name_begins_no_ending(tmp_path):
+    touch(tmp_path, "a.obj", "OBJ/a.v2.obj", "PLY/a.v2.ply", "b.v2.obj", "OBJ/b.v2.obj")
+    assert sorted(taken(tmp_path)) == ["OBJ/a.v2.obj", "OBJ/b.v2.obj", "a.obj", "b.v2.obj"]
+
+
 def test_no_object_is_trained_on_in_one_format_and_tested_in_another(tmp_path):
     objects = ("chair", "desk", "lamp", "sofa", "table")
     kinds = {"DAE format": "dae", "GLTF format": "glb", "OBJ format": "obj"}

@@ -45,8 +45,7 @@ def quarters():
 def draw(mesh, backend="embree", size=64):
     """RGBA of a mesh from the front, unlit or lit from behind the camera."""
     rig = orbit(1, size, elevation=0.0)
-    with MeshRenderer(backend) as renderer:
-        return renderer.render(mesh_parts(mesh), rig, lighting="headlight").rgba[0].astype(int)
+    return MeshRenderer(backend).render(mesh_parts(mesh), rig, lighting="headlight").rgba[0].astype(int)
 
 
 def sheet(path, *, uv=SHEET_UV, change=None, image=None, **keywords):
@@ -431,8 +430,7 @@ def from_the_front(mesh, size=128):
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] = eye
     rig = Rig(pose[None], rig.intrinsics, size, size, rig.near, rig.far)
-    with MeshRenderer("embree") as renderer:
-        return renderer.render(mesh_parts(mesh), rig, lighting="headlight").rgba[0].astype(int)
+    return MeshRenderer("embree").render(mesh_parts(mesh), rig, lighting="headlight").rgba[0].astype(int)
 
 
 @pytest.mark.skipif(not KHRONOS.is_dir(), reason="Khronos' samples in ../shared/meshes/khronos are not here")

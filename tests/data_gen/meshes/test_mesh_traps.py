@@ -552,8 +552,7 @@ def test_a_quarter_of_a_million_faces_are_drawn_as_they_are(tmp_path):
     mesh = load_mesh(path)
     assert (mesh.face_count, mesh.warnings) == (2**18, ())
     rig = fixed(1, 64)
-    with MeshRenderer() as renderer:
-        alpha = renderer.render(mesh_parts(mesh), rig).rgba[0, ..., 3] / 255
+    alpha = MeshRenderer().render(mesh_parts(mesh), rig).rgba[0, ..., 3] / 255
     radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(1 / 3.0))
     assert alpha.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
 

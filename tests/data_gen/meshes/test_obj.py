@@ -34,6 +34,12 @@ def cube(*, groups, uv=False):
     return "\n".join(lines) + "\n"
 
 
+def test_errors_name_the_first_line_of_a_continued_statement(tmp_path):
+    for body, line in (("f 1 2 \\\n3\nf 1 2 x\n", 3), ("f 1 2 \\\nx\n", 1), ("v 0 \\\n\\\n0 0\nf 1 2 3\nv 0 x 0\n", 5)):
+        with pytest.raises(MeshError, match=f"line {len(OBJ_SOLID.splitlines()) + line}: "):
+            load_mesh(write_obj(tmp_path, body=OBJ_SOLID + body))
+
+
 def test_smoothing_groups_are_apart_from_each_other(tmp_path):
     def against_faces(body):
         part = only_part(load_mesh(write_obj(tmp_path, mtl=PAINT, body=body)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mesh_writers import dae_text
 
-from data_gen.meshes.mesh import load_mesh, mesh_parts
+from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts
 from data_gen.meshes.triangulate import triangulate
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
@@ -39,18 +39,21 @@ def area_in_file(mesh):
     return sum(part.area for part in mesh_parts(mesh)) / scale
 
 
-def write(folder, kind):
-    """The U as one polygon."""
-    points = [f"{x} {y} 0" for x, y in U]
+def write(folder, kind, faces=(range(8),)):
+    """Faces on the corners of the U, which is one polygon; COLLADA of the U alone."""
+    points = "".join(f"{x} {y} 0\n" for x, y in U)
+    rows = "".join(" ".join(map(str, (len(face), *face))) + "\n" for face in faces)
     path = folder / f"a.{kind}"
     if kind == "obj":
-        path.write_text("".join(f"v {point}\n" for point in points) + "f " + " ".join("12345678") + "\n")
+        lines = [f"v {point}" for point in points.splitlines()]
+        lines += [" ".join(["f", *(str(corner + 1) for corner in face)]) for face in faces]
+        path.write_text("\n".join(lines) + "\n")
     elif kind == "off":
-        path.write_text("OFF\n8 1 0\n" + "\n".join(points) + "\n8 0 1 2 3 4 5 6 7\n")
+        path.write_text(f"OFF\n8 {len(faces)} 0\n{points}{rows}")
     elif kind == "ply":
         head = "ply\nformat ascii 1.0\nelement vertex 8\n" + "".join(f"property float {axis}\n" for axis in "xyz")
-        head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-        path.write_text(head + "\n".join(points) + "\n8 0 1 2 3 4 5 6 7\n")
+        head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        path.write_text(head + points + rows)
     else:
         text = dae_text(positions=[[*point, 0] for point in U]).replace('count="12"', 'count="24"')
         text = text.replace('<accessor source="#pa" count="4"', '<accessor source="#pa" count="8"')
@@ -68,6 +71,16 @@ def test_concave_polygons_of_every_format_are_not_filled(tmp_path, kind):
     mesh = load_mesh(write(tmp_path, kind))
     assert mesh.warnings == ()
     assert area_in_file(mesh) == pytest.approx(7.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["obj", "off", "ply"])
+@pytest.mark.parametrize("corners", [3, 4])
+def test_faces_of_two_corners_are_left_out_with_a_warning(tmp_path, kind, corners):
+    mesh = load_mesh(write(tmp_path, kind, [range(corners), (0, 1)]))
+    assert mesh.face_count == corners - 2
+    assert "1 faces with fewer than 3 corners left out" in mesh.warnings
+    with pytest.raises(MeshError, match="found none"):
+        load_mesh(write(tmp_path, kind, [(0, 1)]))
 
 
 def test_quadrilaterals_of_a_ply_keep_their_colours(tmp_path):

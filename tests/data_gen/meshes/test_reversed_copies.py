@@ -23,8 +23,7 @@ def backend(request):
 
 
 def draw(backend, mesh, size=64):
-    with MeshRenderer(backend) as renderer:
-        return renderer.render(mesh_parts(mesh), rigs.fixed(4, size)).rgba.astype(int)
+    return MeshRenderer(backend).render(mesh_parts(mesh), rigs.fixed(4, size)).rgba.astype(int)
 
 
 def write_obj(path, parts):
@@ -91,6 +90,6 @@ def test_where_nothing_else_is_the_inner_side_of_a_one_sided_surface_is_seen(tmp
     """A hole in the mask of one view would carve the surface away that the others see."""
     sheet = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], dtype=np.float32)
     (tmp_path / "a.glb").write_bytes(glb_bytes(*gltf(positions=sheet, faces=[[0, 1, 2]])))
-    with MeshRenderer(backend) as renderer:
-        views = renderer.render(mesh_parts(load_mesh(tmp_path / "a.glb")), rigs.orbit(2, 32, elevation=0.0)).rgba
+    rig = rigs.orbit(2, 32, elevation=0.0)
+    views = MeshRenderer(backend).render(mesh_parts(load_mesh(tmp_path / "a.glb")), rig).rgba
     assert (views[:, 16, 16, 3] == 255).all()

@@ -128,6 +128,11 @@ def test_the_official_split_counts_where_it_is_given(tmp_path):
     assert [mesh.split for mesh in find_meshes(tmp_path).meshes] == ["test", "train", None]
 
 
+def test_a_row_of_a_split_file_may_lack_its_last_column(tmp_path):
+    (tmp_path / "s.csv").write_text(f"modelId,split,synsetId\na,test,{PLANE}\nb,val\n")
+    assert read_split_file(tmp_path / "s.csv")[PLANE, "a"] == "test"
+
+
 def test_a_wrong_split_file_is_refused(tmp_path):
     write_model(tmp_path, PLANE, "a", 2)
     path = tmp_path / "s.csv"

@@ -61,8 +61,7 @@ def tricky_parts():
 
 def draw_tricky(backend):
     """The tricky parts by one renderer: RGBA (view, height, width, 4)."""
-    with MeshRenderer(backend) as renderer:
-        return renderer.render(tricky_parts(), rigs.fixed(4, 48)).rgba
+    return MeshRenderer(backend).render(tricky_parts(), rigs.fixed(4, 48)).rgba
 
 
 if __name__ == "__main__":

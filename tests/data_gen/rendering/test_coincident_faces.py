@@ -64,18 +64,18 @@ def test_of_faces_in_one_place_the_one_that_faces_the_camera_is_seen(backend, ki
     colours = [(200, 40, 40, 255), (40, 60, 220, 255)]
     sides = _doubled(kind)
     rig = rigs.fixed(6, 64)
-    with MeshRenderer(backend) as renderer:
-        parts = [_painted(side, colour) for side, colour in zip(sides, colours, strict=True)]
-        found = renderer.render(parts, rig).rgba.astype(int)
-        off = 0.0
-        for view, pose in enumerate(rig.world_from_camera):
-            one = Rig(pose[None], rig.intrinsics[view], 64, 64, rig.near, rig.far)
-            kept = [(_culled(side, pose[:3, 3]), colour) for side, colour in zip(sides, colours, strict=True)]
-            parts = [_painted(corners, colour) for corners, colour in kept if len(corners)]
-            expected = renderer.render(parts, one).rgba[0].astype(int)
-            seen = (expected[..., 3] > 0) | (found[view, ..., 3] > 0)
-            wrong = (np.abs(expected - found[view]) > 25).any(axis=-1)
-            off = max(off, wrong.sum() / seen.sum())
+    renderer = MeshRenderer(backend)
+    parts = [_painted(side, colour) for side, colour in zip(sides, colours, strict=True)]
+    found = renderer.render(parts, rig).rgba.astype(int)
+    off = 0.0
+    for view, pose in enumerate(rig.world_from_camera):
+        one = Rig(pose[None], rig.intrinsics[view], 64, 64, rig.near, rig.far)
+        kept = [(_culled(side, pose[:3, 3]), colour) for side, colour in zip(sides, colours, strict=True)]
+        parts = [_painted(corners, colour) for corners, colour in kept if len(corners)]
+        expected = renderer.render(parts, one).rgba[0].astype(int)
+        seen = (expected[..., 3] > 0) | (found[view, ..., 3] > 0)
+        wrong = (np.abs(expected - found[view]) > 25).any(axis=-1)
+        off = max(off, wrong.sum() / seen.sum())
     assert off < 0.002
 
 
@@ -83,8 +83,7 @@ def test_doubled_glass_is_blended_once(backend):
     pane = np.array([[[-1, -1, 0], [1, -1, 0], [0, 1, 0]]], dtype=float)
     rig = rigs.orbit(2, 16, elevation=0.0)
     parts = [_painted(side, (250, 250, 250, 102)) for side in (pane, pane[:, ::-1])]
-    with MeshRenderer(backend) as renderer:
-        alpha = renderer.render(parts, rig).rgba[:, 8, 8, 3]
+    alpha = MeshRenderer(backend).render(parts, rig).rgba[:, 8, 8, 3]
     np.testing.assert_allclose(alpha, 102, atol=1)
 
 
@@ -95,8 +94,7 @@ def test_a_smooth_ball_with_every_face_doubled_is_shaded_as_one_without(tmp_path
     pictures = []
     for name, faces in (("one.obj", ball.faces), ("two.obj", np.concatenate((ball.faces, ball.faces[:, ::-1])))):
         (tmp_path / name).write_text(rows + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces))
-        with MeshRenderer("embree") as renderer:
-            pictures.append(renderer.render(mesh_parts(load_mesh(tmp_path / name)), rigs.fixed(1, 48)).rgba)
+        pictures.append(MeshRenderer("embree").render(mesh_parts(load_mesh(tmp_path / name)), rigs.fixed(1, 48)).rgba)
     assert np.array_equal(*pictures)
 
 
@@ -105,8 +103,7 @@ def test_what_has_one_side_only_is_still_seen_from_both(backend):
     sheet = np.array([[[-0.5, -0.5, 0], [0.5, -0.5, 0], [0, 0.5, 0]]])
     wall = 2 * sheet + [0, 0, 0.002]
     rig = rigs.orbit(2, 32, elevation=0.0)
-    with MeshRenderer(backend) as renderer:
-        parts = [_painted(sheet, (220, 30, 30, 255)), _painted(wall, (30, 30, 220, 255))]
-        front, back = renderer.render(parts, rig).rgba[:, 15, 16]
+    parts = [_painted(sheet, (220, 30, 30, 255)), _painted(wall, (30, 30, 220, 255))]
+    front, back = MeshRenderer(backend).render(parts, rig).rgba[:, 15, 16]
     assert front[2] > front[0]
     assert back[0] > back[2]

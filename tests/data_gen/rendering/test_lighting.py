@@ -5,13 +5,13 @@ import pytest
 
 from data_gen.rendering.lighting import LIGHTING_PRESETS, Light, Lighting, resolve_lighting
 from data_gen.rendering.shading import SHOULDER, facing, shade
-from data_gen.rigs import fixed
+from data_gen.rigs import random
 from hyperplanes.utilities.colour import linear_from_srgb, srgb_from_linear
 
 
 def _sphere_shades(lighting, albedo, towards=None):
     """Shades of a matt sphere: normals all over, each seen from straight in front or from one direction."""
-    normals = fixed(400, 8, lowest=-90.0, highest=90.0).camera_centres / 3.0
+    normals = random(400, 8, seed=0).world_from_camera[:, :3, 3] / 3.0
     views = normals if towards is None else np.broadcast_to(np.asarray(towards, float), normals.shape)
     normals = facing(normals, normals, views)
     count = len(normals)

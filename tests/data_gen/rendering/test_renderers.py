@@ -60,6 +60,12 @@ def test_order_is_egl_osmesa_embree(pretend):
     assert "apt-get install -y libegl1 libgl1" in renderer.advice[0]
 
 
+def test_a_better_renderer_is_advised_wherever_there_is_one(pretend):
+    pretend("pyrender-osmesa", "embree")
+    (advice,) = renderers.find_renderer().advice
+    assert advice.startswith("pyrender-egl does not work here")
+
+
 def test_best_is_taken_without_trying_the_rest(pretend):
     tried = pretend("pyrender-egl", "embree")
     assert renderers.find_renderer() == RendererInfo("pyrender-egl", "fine")
