@@ -155,11 +155,9 @@ class AdaptedField:
             generator: of the places of samples; on the CPU.
             differentiable: with gradients; else in chunks, each ray up to where it is opaque.
         """
-        if isinstance(self.field, Field):
-            rays = rays.to(self.field.dtype)
         return render(
-            self.field, rays, self.sampling, occupancy=self.occupancy, proposal=self.proposal, generator=generator,
-            differentiable=differentiable,
+            self.field, rays.to(self.dtype), self.sampling, occupancy=self.occupancy, proposal=self.proposal,
+            generator=generator, differentiable=differentiable,
         )  # fmt: skip
 
     @checked

@@ -74,10 +74,11 @@ class StackedField(AdaptedField):
         return f"{type(self).__name__}({super().__repr__()}, {self.share:.0%} of {self.other!r})"
 
     def with_sampling(self, sampling: Sampler) -> AdaptedField:
-        """As `AdaptedField.with_sampling`, of the learned field; the visual hull keeps its own."""
-        if self.overruled:
-            return replace(self, other=self.other.with_sampling(sampling))
-        return super().with_sampling(sampling)
+        """As `AdaptedField.with_sampling`; the visual hull keeps its own sampler."""
+        own, other = self._samplers(sampling)
+        return replace(
+            self, sampling=own or self.sampling, other=self.other.with_sampling(other) if other else self.other
+        )
 
     @without_autocast
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
@@ -98,8 +99,8 @@ class StackedField(AdaptedField):
         *,
         mixed_precision: bool = True,
     ) -> Pictures:
-        """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the learned field's alone."""
-        of_own, of_other = (None, sampling) if self.overruled else (sampling, None)
+        """The mean of the pictures of both, as `AdaptedField.render`; the visual hull keeps its own sampler."""
+        of_own, of_other = self._samplers(sampling)
         own = partial(super().render, cameras, of_own, antialias, mixed_precision=mixed_precision)
         if not self.share and self.gate is None:
             return own()
@@ -107,6 +108,10 @@ class StackedField(AdaptedField):
         if not (self.thread_safe and self.other.thread_safe):
             return self._mean(own(), other())
         return self._mean(*at_once(own, other, self.occupancy.occupied.device))
+
+    def _samplers(self, sampling: Sampler | None) -> tuple[Sampler | None, Sampler | None]:
+        """The given sampler for whichever of the field and the other one is learned, None for the visual hull."""
+        return (None, sampling) if self.overruled else (sampling, None)
 
     def _mean(self, own: Pixels, other: Pixels) -> Pixels:
         """The mean of colours and opacities, and the expected distance of what both show."""
@@ -129,6 +134,10 @@ class StackedField(AdaptedField):
 @dataclass(frozen=True, repr=False)
 class AveragedField(StackedField):
     """A field after gradient steps, whose pictures are means with those of the field before them (`average`)."""
+
+    def _samplers(self, sampling: Sampler | None) -> tuple[Sampler | None, Sampler | None]:
+        """The given sampler for both, which are learned."""
+        return sampling, sampling
 
 
 @dataclass(frozen=True)
