@@ -164,7 +164,7 @@ def fine_tune_to(
     Raises:
         NoProgressError: the steps lowered nothing: wild rates end in pictures that are empty, or in no numbers.
     """
-    check_fine_tuning(settings, steps, len(views or context.views), network.config, network.target)
+    check_fine_tuning(settings, steps, len(context.given), network.config, network.target)
     if not steps:
         if on_step is not None:
             on_step(0)

@@ -10,10 +10,11 @@ from hyperplanes.adaptation import HyperPlanes, descent
 from hyperplanes.adaptation.context import trained_on
 from hyperplanes.adaptation.descent import split_holdout
 from hyperplanes.adaptation.fine_tuned import FromScratch
-from hyperplanes.adaptation.fine_tuning import made_anyway, make_descent
+from hyperplanes.adaptation.fine_tuning import fine_tune_to, made_anyway, make_descent
 from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.stacking import AveragedField
 from hyperplanes.configuration.fine_tuning import AVERAGE, MANY_VIEWS, FineTuning
+from hyperplanes.geometry.reflections import Plane, Symmetry
 from tests.adaptation.test_learned_steps import stepping
 from tests.reference_rendering import ball_views, ring
 
@@ -65,6 +66,13 @@ def test_who_has_no_field_before_the_steps_is_shown_as_they_end():
         adapter.fine_tune(ball_views(ring(MANY_VIEWS)), 1, replace(FEW, average=0.2))
     with pytest.raises(ValueError, match="average: expected a share"):
         FineTuning(average=1.5)
+
+
+def test_reflections_are_not_counted_where_an_average_is_given():
+    adapter, across = stepping(), Symmetry(Plane((1.0, 0.0, 0.0)))
+    context = adapter.prepare(ball_views(ring(MANY_VIEWS - 4)), symmetry=across)
+    assert len(context.views) > MANY_VIEWS
+    assert fine_tune_to(adapter, context, 1, replace(FEW, average=0.3)).share == 0.3
 
 
 @pytest.mark.parametrize("cells", [None, 40])
