@@ -23,7 +23,7 @@ from hyperplanes.fields import find_targets
 from hyperplanes.hypernetwork import KINDS
 from hyperplanes.utilities.arguments import kind_of
 from hyperplanes.utilities.errors import nearest
-from hyperplanes.utilities.files import DataError, read_bytes
+from hyperplanes.utilities.files import MALFORMED, DataError, read_bytes
 from hyperplanes.utilities.settings import SettingsError, structure
 from hyperplanes.utilities.writing import write_whole
 
@@ -76,7 +76,7 @@ def read_experiment(path: Path) -> dict[str, Any]:
         raise DataError(path, "a YAML file of settings", error.strerror or str(error), "check the path") from None
     try:
         value = yaml.load(text, _Loader)  # noqa: S506 - a subclass of SafeLoader
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, *MALFORMED) as error:
         raise DataError(path, "YAML", str(error) or type(error).__name__, remedy) from None
     if not isinstance(value, dict):
         raise DataError(path, "a mapping of settings", f"a {type(value).__name__}", remedy)
@@ -188,7 +188,7 @@ def parse_options(given: Sequence[str]) -> dict[str, Any]:
                 raise SettingsError(option, "given beside the whole of which it is a part; leave one of them out")
         try:
             read = [yaml.load(value, _Loader) for value in values]  # noqa: S506 - a subclass of SafeLoader
-        except (yaml.YAMLError, RecursionError, ValueError) as error:
+        except (yaml.YAMLError, *MALFORMED) as error:
             found, problem = kind_of(" ".join(values)), " ".join(str(error).split())
             raise SettingsError(option, f"expected a plain value, got {found} ({problem})") from None
         if isinstance(node.get(names[-1]), dict):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -49,6 +50,10 @@ class TargetConfig:
     point_frequencies: Annotated[int, range(33)] = 10
     direction_frequencies: Annotated[int, range(33)] = 4
     density_scale: float = 25.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.density_scale < math.inf:
+            raise ValueError(f"density_scale: expected more than 0 and finite, got {self.density_scale}")
 
 
 class Target(nn.Module):

@@ -193,6 +193,14 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
             ["--model.symmetry.plane.normal", "[1, 0, .nan]"],
             "plane.normal: expected finite numbers, got a tuple of 1.0,",
         ),
+        (
+            ["--model.network.density-scale", "0"],
+            "--model.network.density-scale: expected more than 0 and finite, got 0",
+        ),
+        (
+            ["--model.initialisation", "{inner_rate: -1}"],
+            "--model.initialisation.inner-rate: expected a finite number of 0 or more, got -1",
+        ),
         (["--model.hull-share", "2"], "--model.hull-share: expected a share from 0 to 1, got 2.0"),
         (
             ["--model.symmetry", "{plane: {normal: [1, 0, 0]}, order: 1000}"],
@@ -202,6 +210,7 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
         (["--model.network.grid", "8"], "--model.network.grid: an unknown entry"),
         (["--model.network", "3"], "--model.network: expected its entries by name, got 3"),
         (["--training.rays", "["], "--training.rays: expected a plain value, got '['"),
+        (["--training.rays", "!!int ''"], "--training.rays: expected a plain value"),
         (["--training.rays", "[" * 3000], "[[[ (maximum recursion depth exceeded"),
         (["--method", "magic"], "method: expected one of hyperplanes, "),
         (["--config", "OUT/none.yaml"], "none.yaml: expected a YAML file of settings"),
