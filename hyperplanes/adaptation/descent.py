@@ -6,9 +6,8 @@ by it, and the variables follow the gradient of the squared error (HyperPlanes, 
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,12 +19,11 @@ from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.optimisers import make_optimisers
 from hyperplanes.configuration.fine_tuning import RATES, FineTuning
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
 
-__all__ = ["Descent", "Variables", "contrast", "draw_pixels", "pixels_of", "ray_loss", "split_holdout"]
+__all__ = ["Descent", "contrast", "draw_pixels", "pixels_of", "ray_loss", "split_holdout"]
 
 HOLDOUT_RAYS = 4096  # of held-out views that "auto" compares
 PART = 512  # rays of a step whose gradients one thread finds, at most
@@ -101,45 +99,13 @@ def draw_pixels(
 
 
 @dataclass(frozen=True)
-class Variables:
-    """What a descent optimises, and the weights of the field that it makes.
-
-    Attributes:
-        tensors: optimised in place.
-        weights: the parameters of the field, as a function of the tensors as they are now.
-    """
-
-    tensors: Sequence[Tensor]
-    weights: Callable[[], Parameters]
-
-    @classmethod
-    def of_weights(cls, start: Mapping[str, Tensor]) -> Variables:
-        """The weights themselves, copied from where the descent begins."""
-        trainable = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
-        return cls(list(trainable.values()), lambda: trainable if torch.is_grad_enabled() else trainable.detach())
-
-    @classmethod
-    def of_hypernetwork(
-        cls, hypernetwork: HyperNetwork, theta: Parameters, update: Callable[[HyperNetwork], Parameters]
-    ) -> Variables:
-        """A copy of a hypernetwork whose update is added to frozen weights, as in the paper.
-
-        Args:
-            hypernetwork: stays as it is.
-            theta: the frozen weights.
-            update: that a hypernetwork makes of the object.
-        """
-        tuned = copy.deepcopy(hypernetwork).eval().requires_grad_(True)
-        return cls([*tuned.parameters()], lambda: theta + update(tuned))
-
-
-@dataclass(frozen=True)
 class Descent:
     """A descent on the squared error of rays of support views.
 
     Attributes:
-        field: the field that the variables make now, to which the views of these indices, if any, are not shown.
+        field: the field that the tensors make now, to which the views of these indices, if any, are not shown.
         tensors: what is optimised, in place.
+        weights: the parameters of the field that the tensors make now.
         views: where rays and their colours come from.
         settings: rays, rates and seed; a `draw` of None is uniform.
         pixels: flat indices (view, row, column) of `views` to draw from, ascending; all where None.
@@ -148,6 +114,7 @@ class Descent:
 
     field: Callable[[Int[Tensor, " masked"] | None], AdaptedField]
     tensors: Sequence[Tensor]
+    weights: Callable[[], Parameters]
     views: Views
     settings: FineTuning
     pixels: Int[Tensor, " pixel"] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +14,7 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.context import SupportContext, observe, trained_on
-from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
+from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import stacked_field, tuned_field
@@ -96,10 +97,10 @@ def fine_tune(
     placed = to_canonical_frame(network, shown)
     holdout = placed.rotation.views(holdout)
     context = placed.context(network)
-    trial, variables = make_descent(network, context, settings, trained_on(context, placed.views))
+    trial = make_descent(network, context, settings, trained_on(context, placed.views))
     pixels = network.live_pixels_of(context, holdout)
     unchanged = network.field(context, updated_weights(network, context))
-    before, share = average_of(network, context, settings, variables)
+    before, share = average_of(network, context, settings, trial)
     beside = None if before is None else network.field(context, before)
     stop = trial.best_stop(holdout, unchanged=unchanged, beside=beside, share=share, pixels=pixels, on_step=on_trial)
 
@@ -170,8 +171,8 @@ def fine_tune_to(
             on_step(0)
         with torch.no_grad():
             return stacked_field(network, context, updated_weights(network, context))
-    descent, variables = make_descent(network, context, settings, views)
-    average = average_of(network, context, settings, variables)
+    descent = make_descent(network, context, settings, views)
+    average = average_of(network, context, settings, descent)
     before, _ = descent.errors()
     for done in descent.run(steps if schedule is None else schedule):
         if on_step is not None:
@@ -180,7 +181,7 @@ def fine_tune_to(
             break
     after, empty = descent.errors()
     with torch.no_grad():
-        made = tuned_field(network, context, variables.weights(), *average)
+        made = tuned_field(network, context, descent.weights(), *average)
     if not after < max(before, empty * NEARLY):
         raise NoProgressError(
             f"fine-tuning: expected {steps} steps to lower the squared error, {before:.3g}, got {after:.3g}, where an "
@@ -191,7 +192,7 @@ def fine_tune_to(
 
 
 def average_of(
-    network: HyperPlanesNetwork, context: SupportContext, settings: FineTuning, variables: Variables
+    network: HyperPlanesNetwork, context: SupportContext, settings: FineTuning, descent: Descent
 ) -> tuple[Parameters | None, float]:
     """The weights of the field that pictures after gradient steps are averaged with, and its share in them.
 
@@ -201,7 +202,7 @@ def average_of(
         network: the model.
         context: the object.
         settings: as in `fine_tune`.
-        variables: of `make_descent`, before the first step.
+        descent: before its first step.
 
     Returns:
         None and 0 where pictures are those after the steps alone.
@@ -211,7 +212,7 @@ def average_of(
     share = settings.average_share(len(context.given))
     if not share or not network.reads_volume:
         return None, 0.0
-    return Parameters((name, value.detach().clone()) for name, value in variables.weights().items()), share
+    return Parameters((name, value.detach().clone()) for name, value in descent.weights().items()), share
 
 
 def make_descent(
@@ -220,7 +221,7 @@ def make_descent(
     settings: FineTuning,
     views: Views | None = None,
     start: Parameters | None = None,
-) -> tuple[Descent, Variables]:
+) -> Descent:
     """Gradient descent on rays of an object's views: what fine-tuning and learned initialisations do.
 
     Args:
@@ -236,27 +237,29 @@ def make_descent(
         settings = replace(settings, cells=0)
     if settings.trainable == "weights":
         settings = settings.with_rates(network.target.fine_tuning_rates)
-    variables = _variables(network, context, settings, start)
+    tensors, weights = _variables(network, context, settings, start)
 
     def field(masked: Tensor | None) -> AdaptedField:
-        return network.field(context if masked is None else context.mask_views(masked), variables.weights())
+        return network.field(context if masked is None else context.mask_views(masked), weights())
 
     pixels = network.live_pixels_of(context, views)
-    return Descent(field, variables.tensors, views, settings, pixels, masks_views=any_views), variables
+    return Descent(field, tensors, weights, views, settings, pixels, masks_views=any_views)
 
 
 def _variables(
     network: HyperPlanesNetwork, context: SupportContext, settings: FineTuning, start: Parameters | None
-) -> Variables:
-    """What a descent optimises: weights, or a copy of the hypernetwork."""
+) -> tuple[list[Tensor], Callable[[], Parameters]]:
+    """What a descent optimises, in place, and the weights of the field that it makes of that."""
     if settings.trainable == "hypernetwork" and network.hypernetwork is not None:
         observed, theta = observe([context], network.hypernetwork.resolution), network.theta.detach()
-        return Variables.of_hypernetwork(network.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
+        tuned = copy.deepcopy(network.hypernetwork).eval().requires_grad_(True)
+        return list(tuned.parameters()), lambda: theta + tuned(observed, theta)[0]
     if start is None:
         # weights that are partly random are so without learned steps
         own = network.adapted_weights(context) if settings.fresh else updated_weights(network, context)
         start = network.finer(_refreshed(network, own, settings), settings.cells or 0)
-    return Variables.of_weights(start)
+    trainable = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
+    return list(trainable.values()), lambda: trainable if torch.is_grad_enabled() else trainable.detach()
 
 
 def _refreshed(network: HyperPlanesNetwork, weights: Parameters, settings: FineTuning) -> Parameters:

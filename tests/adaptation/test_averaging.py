@@ -97,7 +97,7 @@ def test_how_many_steps_are_best_is_found_by_means(monkeypatch):
     views = trained_on(context, shown)
     beside = adapter.field(context, updated_weights(adapter, context))
     stops = [
-        make_descent(adapter, context, replace(FEW, max_steps=6), views)[0].best_stop(
+        make_descent(adapter, context, replace(FEW, max_steps=6), views).best_stop(
             holdout, unchanged=beside, beside=beside, share=share
         )
         for share in (0.0, 1.0)
