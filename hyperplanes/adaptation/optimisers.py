@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -11,9 +12,7 @@ from torch import Tensor
 from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.utilities.uncompiled_optimisers import SGD, Adam, Optimizer
 
-__all__ = ["OPTIMISERS", "Muon", "make_optimisers", "orthogonalise"]
-
-OPTIMISERS = ("adam", "muon", "sgd")
+__all__ = ["Muon", "make_optimisers", "orthogonalise"]
 
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of the quintic Newton-Schulz iteration of Jordan et al. 2024
 ITERATIONS = 5
@@ -79,7 +78,7 @@ class Muon(Optimizer):
 
 def make_optimisers(
     variables: Sequence[Tensor],
-    name: str,
+    name: Literal["adam", "muon", "sgd"],
     adam_rate: float,
     muon_rate: float,
     betas: tuple[float, float] = (0.9, 0.999),
@@ -95,12 +94,7 @@ def make_optimisers(
 
     Returns:
         One optimiser, or Adam and Muon; none has an empty list of parameters.
-
-    Raises:
-        ValueError: an unknown name.
     """
-    if name not in OPTIMISERS:
-        raise ValueError(f"optimiser: expected one of {', '.join(map(repr, OPTIMISERS))}, got {name!r}")
     if name == "sgd":
         return [SGD(list(variables), adam_rate)]
     hidden = [name == "muon" and value.ndim == 2 and min(value.shape) >= NARROWEST for value in variables]

@@ -13,7 +13,7 @@ __all__ = ["AVERAGE", "CELLS", "FINE_VIEWS", "FRESH", "MANY_VIEWS", "RATES", "Fi
 
 Steps: TypeAlias = int | Literal["auto"]
 
-RATES: dict[str, tuple[str, float, float]] = {
+RATES: dict[str, tuple[Literal["adam", "muon"], float, float]] = {
     "weights": ("muon", 2e-3, 0.04),
     "hypernetwork": ("adam", 3e-4, 0.0),
 }
