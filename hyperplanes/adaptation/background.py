@@ -84,16 +84,13 @@ class Separated:
         return replace(views, images=views.images * masks + (1 - masks), masks=masks)
 
 
-def separate_background(
-    views: Views, *, seed: int = 0, on_step: Callable[[int, int], None] | None = None, room: bool = True
-) -> Separated:
+def separate_background(views: Views, *, seed: int = 0, on_step: Callable[[int, int], None] | None = None) -> Separated:
     """The object within the bounds of some views, and the room around it.
 
     Args:
         views: photographs without masks, and without lens distortion.
         seed: of rays and samples.
         on_step: called with the number of steps done and that of all.
-        room: without, all that the photographs show has to lie in the sphere.
 
     Raises:
         ValueError: fewer than five views, or cameras with lens distortion.
@@ -118,7 +115,7 @@ def separate_background(
             descent.param_groups[0]["lr"] = RATE * (LAST_RATE / RATE) ** (done / total)
             # squared error of some rays; opacities between 0 and 1 cost something once there is a shape
             rays, truth = small.sample_rays(RAYS, generator=generator)
-            colour, opacity = _composited(inner, outer, rays, views.bounds, generator, room)
+            colour, opacity = _composited(inner, outer, rays, views.bounds, generator)
             loss = (colour - truth).square().mean()
             if done > DECIDED * total:
                 loss = loss + CERTAIN * (opacity * (1 - opacity)).mean()
@@ -132,12 +129,7 @@ def separate_background(
 
 
 def _composited(
-    inner: Grid,
-    outer: Grid,
-    rays: Rays,
-    bounds: Sphere,
-    generator: torch.Generator | None = None,
-    room: bool = True,
+    inner: Grid, outer: Grid, rays: Rays, bounds: Sphere, generator: torch.Generator | None = None
 ) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 1"]]:
     """Colours of rays through both grids, and the share of the inner one."""
     count = int(SAMPLES * inner.shape[1])
@@ -160,8 +152,6 @@ def _composited(
     points = _contracted(rays.at(around), bounds)
     lengths = torch.cat([_lengths(points[:, :BEFORE]), _lengths(points[:, BEFORE:])], 1)
     outside = _read(outer, points, Sphere(radius=2.0), lengths * outer.shape[1] / 4)
-    if not room:  # nothing but white
-        outside = 0 * outside[0], 1 + 0 * outside[1]
     depth, colour = (torch.cat([o[:, :BEFORE], i, o[:, BEFORE:]], 1) for i, o in zip(inside, outside, strict=True))
     # what each takes of the light; the last sample stands for all that is behind it
     light = torch.exp(-torch.cat([torch.zeros_like(near), depth[:, :-1].cumsum(1)], 1))

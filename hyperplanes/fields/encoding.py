@@ -11,9 +11,9 @@ from hyperplanes.geometry.chosen_views import OCTAVES
 __all__ = ["encoded_size", "encode"]
 
 
-def encoded_size(frequencies: int, size: int = 3) -> int:
-    """Length of an encoded vector."""
-    return size * (1 + 2 * frequencies)
+def encoded_size(frequencies: int) -> int:
+    """Length of an encoded point or direction."""
+    return 3 * (1 + 2 * frequencies)
 
 
 def encode(values: Float[Tensor, "*vectors"], frequencies: int, dim: int = -1) -> Float[Tensor, "*encoded"]:
