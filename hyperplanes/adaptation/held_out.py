@@ -17,7 +17,6 @@ from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.rendering.footprint import pixels_across
-from hyperplanes.rendering.renderer import render
 from hyperplanes.views import Views
 
 __all__ = ["FEWEST", "HeldOutPixels", "Trial", "hold_out"]
@@ -52,9 +51,8 @@ class HeldOutPixels:
         Args:
             adapted: what is made of the other views.
         """
-        sampling = adapted.sampling.for_rendering(self.across)
-        options = {"occupancy": adapted.occupancy, "proposal": adapted.proposal, "differentiable": False}
-        one, three = (render(adapted.field, rays, sampling, **options) for rays in (self.even, self.uneven))
+        finer = adapted.with_sampling(adapted.sampling.for_rendering(self.across))
+        one, three = (finer.trace(rays, differentiable=False) for rays in (self.even, self.uneven))
         return torch.cat([one.colour, three.pooled(len(SUBPIXELS)).colour]) - self.truth
 
 

@@ -78,12 +78,13 @@ class HullBlend:
         Args:
             planes: the views, with masks; the side of their hull counts, not `side`.
         """
-        region, blend = planes.occupancy, _Blend(planes, planes.occupancy.bounds, self.nearest)
+        region = planes.occupancy
         # voxels whose centre lies in the hull: by all that it enters views would see its surface too near
         inside = centres_in_hull(planes, SOLID - ROUNDING)
         depth = inside.occupied * (2 * OPAQUE / len(region.occupied))
         voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
-        blend = replace(blend, planes=planes.with_penalties(Penalties.alike()).with_surface(inside))
+        shown = planes.with_penalties(Penalties.alike()).with_surface(inside)
+        blend = _Blend(shown, region.bounds, self.nearest)
         sampling = _FirstInHull(self.steps, STOP, planes=planes)
         return AdaptedField(blend, region, sampling, densities=(blend.density,), refined=voxels)
 

@@ -13,6 +13,7 @@ from torch.nn.functional import grid_sample, interpolate
 from hyperplanes.adaptation.base import Pictures
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.rays import pixel_grid
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
@@ -54,8 +55,7 @@ def _through(
         return copied
     # where the picture has what each pixel looks at
     still = torch.eye(4).to(asked.extrinsics)[None]
-    y, x = torch.meshgrid(*(torch.arange(each).to(asked.extrinsics) for each in (height, width)), indexing="ij")
-    pixels = torch.stack([x, y], -1).reshape(1, -1, 2)
+    pixels = pixel_grid(height, width).to(asked.extrinsics)[None]
     points = camera.with_poses(asked, still).unproject(pixels, torch.ones_like(pixels[..., :1]))
     found = camera.with_poses(lens, still.to(lens.extrinsics)).project(points.to(lens.extrinsics)).to(copied)
     # a picture of more pixels is reduced first, averaging
