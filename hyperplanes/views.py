@@ -23,7 +23,7 @@ __all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views", "mo
 
 
 MOST = 1.5
-"""Above which numbers of a picture cannot be meant to lie in [0, 1]; what is rendered may lie a little outside."""
+"""Largest pixel value accepted as an image in [0, 1]; rendered values may overshoot slightly."""
 
 
 def check_values(name: str, values: object) -> None:
@@ -54,7 +54,7 @@ class Views:
     """Posed images of one scene.
 
     Attributes:
-        images: RGB in [0, 1], composited over white; (N, C, H, W) by position, as everywhere in PyTorch.
+        images: RGB in [0, 1], composited over white; shape (N, 3, H, W), as in PyTorch.
         cameras: one a view, OpenCV axes, integer pixel centres.
         masks: opacity in [0, 1], or None where the images came without.
         bounds: the sphere that holds all that is to be reconstructed.

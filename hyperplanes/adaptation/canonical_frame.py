@@ -79,9 +79,9 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
         symmetry: of the object.
 
     Returns:
-        `config.azimuth` where that is known. Else the one of the four by which held-out views are shown best, by the
-        mean of their PSNR; where the plane is across an axis as it is, this must be by GAIN better than none. None
-        where the object has no such plane or more than MOST_PLANES, and with fewer than FEWEST views or more than MOST.
+        `config.azimuth` if that is known. Otherwise the one of the four with the highest mean PSNR on held-out views;
+        if the plane is orthogonal to an axis already, a rotation must gain at least GAIN over none. The rotation by 0
+        if the object has no such plane or more than MOST_PLANES, and with fewer than FEWEST or more than MOST views.
     """
     config = network.config
     if config.azimuth is not None:

@@ -94,8 +94,8 @@ def prepare_context(
         rig: where its planes stand.
         hypernetwork: what reads some of them, if there is one.
         hull_resolution: voxels an axis of the visual hull, at least.
-        carved: without, one voxel that may hold anything stands for the hull; a hypernetwork that reads the hull has it
-            carved in any case.
+        carved: if False, a single occupied voxel replaces the hull. For a hypernetwork that reads the hull it is carved
+            in any case.
         masks_repeated: where there are fewer views than planes, each view is shown at one plane alone.
         symmetry: of the object: reflections of the views count as views, too.
     """

@@ -23,7 +23,9 @@ __all__ = ["FEWEST", "HeldOutPixels", "Trial", "hold_out"]
 
 FEWEST = 5  # views, of which some can be held out
 HELD_OUT = 2  # of them at least
-ONE_IN = 12  # is held out where that is more: 3 of 47 for 2 bring 0.16 ± 0.14 dB (20 objects), all by two of them
+# one view in ONE_IN is held out, if that is more than HELD_OUT: 3 of 47 instead of 2 gain 0.16 ± 0.14 dB (20 objects,
+# all by two of them)
+ONE_IN = 12
 PIXELS = 2048  # of the views that are held out, at whose edges pictures differ most
 EVEN = 0.2  # contrast up to which one ray through a pixel shows what three do: half the rays
 SIZE = 128  # of all of them, along the longer side, at most: 256 pixels find no better shares, in three times the time
@@ -81,8 +83,8 @@ def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | N
         symmetry: by which the others are reflected.
 
     Returns:
-        None with fewer than FEWEST views, without masks, and where the object is seen by the held-out views alone, or
-        not by them.
+        None with fewer than FEWEST views, without masks, and where only the held-out views see the object, or none of
+        them does.
     """
     if len(support) < FEWEST or support.masks is None:
         return None

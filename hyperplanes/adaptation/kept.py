@@ -1,4 +1,4 @@
-"""What was made of views kept on disk by what it was made of, so that two commands on the same views make it once.
+"""A disk cache of what is computed from views, keyed by a hash of its inputs, so that two commands share results.
 
 Adapted fields lie in `$HYPERPLANES_CACHE/adapted`, by default `~/.cache/hyperplanes/adapted`, refined poses and learned
 backgrounds beside them. All of it may be deleted at any time.

@@ -90,7 +90,7 @@ class HyperPlanesNetwork(nn.Module):
 
     @property
     def known_rig(self) -> Rig:
-        """Where the views of the training stood, and how others are matched to them; empty where nothing asks."""
+        """The rig of the training views; empty where neither the field nor a hypernetwork needs it."""
         asked = self.target.reads_planes or self.hypernetwork is not None
         return Rig(self.rig if asked else self.rig[:0], self.config.order)
 
@@ -121,8 +121,8 @@ class HyperPlanesNetwork(nn.Module):
         Args:
             support: the views of one object, on any device and in any precision.
             symmetry: of the object: reflections of the views count as views, too.
-            carved: without, one voxel that may hold anything stands for the hull, for who never asks it. A hypernetwork
-                that reads the hull has it carved in any case.
+            carved: if False, a single occupied voxel replaces the hull, for callers that never query it. For a
+                hypernetwork that reads the hull it is carved in any case.
 
         Raises:
             ValueError: a symmetry where the field knows its views by their places.

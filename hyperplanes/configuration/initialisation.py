@@ -52,12 +52,11 @@ class InitialisationConfig:
             raise ValueError(f"inner_rate: expected a finite number of 0 or more, got {self.inner_rate}")
 
     def descent(self, rays: int | None = None, given: FineTuning | None = None) -> FineTuning:
-        """Plain gradient descent at a constant rate, `inner_rate`, on rays of all pixels, where nothing else is stated.
+        """Settings of plain gradient descent at a constant rate, `inner_rate`, on rays of all pixels by default.
 
         Args:
-            rays: a step; those of a new object where absent.
-            given: settings whose optimiser and rates, where they state any, and whose seed are kept. The rates of
-                another optimiser than "sgd" fall to `given.final_rate_factor`.
+            rays: per step; by default `test_rays`.
+            given: settings that are kept, except `trainable`, `rays` and, with "sgd", `final_rate_factor`, which is 1.
         """
         given = given or FineTuning()
         optimiser = given.optimiser or "sgd"

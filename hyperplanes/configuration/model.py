@@ -32,7 +32,7 @@ class ModelConfig:
     """What a model is made of; saved beside its weights.
 
     Attributes:
-        target: which field: "point_multiplane", "multiplane", "nerf" or "image_based".
+        target: which field: a name of `fields.find_targets()`.
         network: the shape of the target, of the dataclass that the field names (`Target.config_type`).
         hypernetwork: the shape of the hypernetwork, which reads images or a volume; None for one set of weights for all
             objects.

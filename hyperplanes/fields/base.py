@@ -284,7 +284,7 @@ class Field:
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def viewed(self, hidden: Float[Tensor, "point width"], seen: Float[Tensor, "point number"]) -> Tensor:
-        """The layer "view" of the layer "feature" and what depends on the direction, side by side; before its ReLU."""
+        """Output of the layer "view", before ReLU, for the concatenation of "feature" and the direction's inputs."""
         weight, bias, of_view = self._view_of_hidden()
         return torch.addmm(linear(seen, of_view, bias), hidden, weight.T)
 
