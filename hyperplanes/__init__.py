@@ -1,6 +1,6 @@
 """HyperPlanes: a hypernetwork reads a few posed images and writes a NeRF.
 
-What most programs need is here; a name is imported when it is first used, so `import hyperplanes` costs nothing:
+The public API. A name is imported on first use, so `import hyperplanes` is fast:
 
     import hyperplanes as hp
 
@@ -92,7 +92,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for; `__version__` too."""
+    """A public name, imported on first use; `__version__` too."""
     if name == "__version__":
         from importlib.metadata import version
 

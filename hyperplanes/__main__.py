@@ -1,4 +1,4 @@
-"""`python -m hyperplanes`: the command `hyperplanes`, where its folder is not on the path."""
+"""`python -m hyperplanes`: the command `hyperplanes` where it is not on PATH."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The one command: `hyperplanes VERB`. It parses and prints; everything else is in the packages below.
+"""The command `hyperplanes VERB`. It parses and prints; the work is done in the other packages.
 
 A verb's module is imported only when that verb is asked for, so `hyperplanes --help` loads neither torch nor OpenGL.
 """
@@ -26,11 +26,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb.
 
     Args:
-        arguments: what stands after `hyperplanes` on the command line; that of this process where absent.
+        arguments: the command line after `hyperplanes`; by default that of this process.
 
     Returns:
         The exit code: 0 done, 1 done but something is wrong, 2 wrong input, 130 interrupted, 143 terminated,
-        129 its terminal closed. An unknown option, and the help of a verb, end in SystemExit.
+        129 terminal closed. An unknown option and the help of a verb raise SystemExit.
     """
     ended = None
     try:
@@ -46,12 +46,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _flush() -> OSError | None:
-    """Write what is left of our output; what went wrong where that cannot be done."""
+    """Flush standard output; returns the error if that fails."""
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
     except BrokenPipeError:
-        sys.stdout = None  # whoever read our output has gone; nothing is left to be flushed to
+        sys.stdout = None  # the reader of the output has gone, so there is nothing to flush to
     except OSError as error:
         sys.stdout = None
         return error
@@ -79,7 +79,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     except KeyboardInterrupt as interrupt:
         advice = str(interrupt) or "the same command goes on where it can"
         code = interrupt.code if isinstance(interrupt, Terminated) else 130
-        with suppress(OSError):  # of a terminal that was closed
+        with suppress(OSError):  # the terminal may be closed
             _complain(f"hyperplanes {verb}: {'interrupted' if code == 130 else 'terminated'}; {advice}")
         return code
     except BrokenPipeError:
@@ -112,14 +112,14 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
 
 
 def _refuse_repeated(arguments: Sequence[str]) -> None:
-    """Refuse options that stand there twice: of all their values the parsers would keep the last, and say nothing.
+    """Refuse repeated options, of which the parsers would silently keep the last value.
 
     >>> _refuse_repeated(["--what", "images", "mesh", "--page-voxels=64", "--page_voxels", "96"])
     Traceback (most recent call last):
     ValueError: --page-voxels: expected once, got it twice; an option that takes several values takes them side by side
 
     Raises:
-        ValueError: such an option, where no help is asked for.
+        ValueError: a repeated option, unless help is requested.
     """
     options = [each.partition("=")[0].replace("_", "-") for each in arguments if each.startswith("--")]
     repeated = next((each for place, each in enumerate(options) if each in options[:place]), None)
@@ -130,7 +130,7 @@ def _refuse_repeated(arguments: Sequence[str]) -> None:
 
 
 def _with_axes(arguments: list[str]) -> list[str]:
-    """The same with `--up -y` as `--up=-y`: the parser takes what begins with a dash for an option.
+    """The arguments with `--up -y` written `--up=-y`, since the parser would take `-y` for an option.
 
     >>> _with_axes(["--up", "-y", "--size", "64"])
     ['--up=-y', '--size', '64']
@@ -145,7 +145,7 @@ def _with_axes(arguments: list[str]) -> list[str]:
 
 
 def _check_ranges(parsed: Any) -> None:
-    """Refuse whole numbers outside of the range that a verb declares for them, which its parser does not look at."""
+    """Refuse whole numbers outside the range that a verb declares, which the parser does not check."""
     for name, hint in get_type_hints(type(parsed), include_extras=True).items():
         allowed = next((note for note in getattr(hint, "__metadata__", ()) if isinstance(note, range)), None)
         if allowed is not None and getattr(parsed, name) not in allowed:
@@ -154,14 +154,14 @@ def _check_ranges(parsed: Any) -> None:
 
 
 def _brought(module: ModuleType) -> list[str]:
-    """What other installed packages add to the names that a verb takes; only their names are read."""
+    """The names that other installed packages add to those that a verb takes; the packages are not imported."""
     groups: dict[str, str] = getattr(module, "BROUGHT", {})
     found = {what: sorted(each.name for each in find_entries(group)) for what, group in groups.items()}
     return [f"{what} of other packages: {', '.join(names)}." for what, names in found.items() if names]
 
 
 def _say(text: str) -> int:
-    """Print; the exit code."""
+    """Print; returns the exit code."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
@@ -188,7 +188,7 @@ def _overview() -> str:
         f"examples:\n{EXAMPLES}\n\n"
         "options:\n"
         "  --help       this text\n"
-        "  --version    which version this is\n"
+        "  --version    the version\n"
         f"  --traceback  with any verb: show where an error came from (or set {TRACEBACK_VARIABLE}=1)"
     )
 

@@ -1,7 +1,7 @@
-"""Methods by name: what `evaluate --method` takes, of this package and of others, in one registry.
+"""The registry of methods, of this package and of others, by the names that `evaluate --method` takes.
 
-A name may end in a number of gradient steps on the support views (`hyperplanes_100`), in `_auto`, as many as serve
-views that are held out, or in `_swapped`, each object with what was made for another, where the method takes that.
+Where a method allows it, its name may end in a number of gradient steps on the support views (`hyperplanes_100`), in
+`_auto` for the number that is best for held-out views, or in `_swapped` for each object with the update of another.
 Another package adds a method by an entry point of the group `hyperplanes.methods` that names a `Method`.
 """
 
@@ -49,17 +49,17 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Request:
-    """What a method is made of.
+    """What a method is made from.
 
     Attributes:
-        name: as it was asked for, such as "hyperplanes_100".
-        checkpoints: folders by the names of the methods that trained them, such as "hyperplanes".
-        device: where weights go.
+        name: as requested, such as "hyperplanes_100".
+        checkpoints: their folders by the names of the methods that trained them, such as "hyperplanes".
+        device: of the weights.
         settings: of fine-tuning.
-        objects: the support views of the objects that will be asked for; "hyperplanes_swapped" reads them.
-        preset: the shape of fields that need no checkpoint, or its name.
-        protocol: how those are sampled while they are optimised, as in `Preset.by_protocol`.
-        reflections: whether models may be shown views of a symmetric object together with their reflections.
+        objects: the support views of the objects to adapt to, which "hyperplanes_swapped" reads.
+        preset: the preset, or its name, with the shape of fields that need no checkpoint.
+        protocol: how such fields are sampled while they are optimised, as in `Preset.by_protocol`.
+        reflections: whether models may use reflections of the views of a symmetric object.
         steps: gradient steps on the support views of an object, "auto", or None where the name has no number;
             `make_method` reads them from the name.
     """
@@ -75,7 +75,7 @@ class Request:
     steps: Steps | None = None
 
     def configured(self, method: str) -> ModelConfig:
-        """The model of a method at the scale of the preset."""
+        """The model configuration of a method at the scale of the preset."""
         chosen = preset(self.preset) if isinstance(self.preset, str) else self.preset
         return chosen.by_protocol(self.protocol).by_method(method).model
 
@@ -105,12 +105,12 @@ class Method:
     """A method of this or of another package.
 
     Attributes:
-        about: what it stands for.
-        make: its adapter.
+        about: a description.
+        make: makes its adapter.
         steps: whether its name takes a number of gradient steps: "none", "optional", or "required".
-        tuned: what it stands for where fine-tuning steps follow; empty where the steps are part of the method itself.
-        begins_at_zero: 0 steps are written _0, as they are not what the bare name says.
-        swapped: each object with what the method makes for another, where it has such a control.
+        tuned: the description for "... after N fine-tuning steps"; empty if the steps are part of the method itself.
+        begins_at_zero: 0 steps are written _0, since the name without a number means another number of steps.
+        swapped: makes the control in which each object gets the update of another, if there is one.
     """
 
     about: str
@@ -121,16 +121,16 @@ class Method:
     swapped: Callable[[Request], Adapter] | None = None
 
     def describe(self, steps: Steps | None) -> str:
-        """The method in words, after so many steps."""
+        """The method in words, after a number of steps."""
         if steps is None:
             return self.about
         kind = "fine-tuning steps" if self.tuned else "steps"
-        count = f"as many {kind} as left-out views ask for" if steps == "auto" else f"{steps} {kind}"
+        count = f"a number of {kind} chosen by held-out views" if steps == "auto" else f"{steps} {kind}"
         return f"{self.tuned} after {count}" if self.tuned else f"{self.about}, {count}"
 
 
 def _of_checkpoint(name: str) -> Callable[[Request], Adapter]:
-    """The model that a method's name trained, fine-tuned where steps are asked for."""
+    """Makes the model of a method's checkpoint, fine-tuned if steps are requested."""
 
     def make(request: Request) -> Adapter:
         model = request.model(name)
@@ -145,7 +145,7 @@ def _shared_weights(name: str, about: str) -> Method:
 
 
 def _scratch(request: Request) -> Adapter:
-    """The architecture of any checkpoint that there is, from random weights."""
+    """The architecture of an available checkpoint, from random weights."""
     known = ("hyperplanes", *request.checkpoints)
     family = next((each for each in known if each in request.checkpoints), "hyperplanes")
     return FromScratch(request.model(family), request.needed_steps, request.settings)
@@ -158,10 +158,10 @@ def _field_scratch(name: str, request: Request) -> Adapter:
 
 
 def _optimised(model: HyperPlanes, request: Request, trained: ModelConfig | None = None) -> FineTuned:
-    """Gradient descent from these weights, as those of a trained model are optimised, or of the model itself.
+    """Gradient descent from the weights of a model, as configured in the model or in another, trained one.
 
     Raises:
-        ValueError: settings that optimise something else than the weights.
+        ValueError: settings that do not optimise the weights.
     """
     if request.settings.trainable != "weights":
         found = request.settings.trainable
@@ -173,7 +173,7 @@ def _optimised(model: HyperPlanes, request: Request, trained: ModelConfig | None
 
 
 def _standard(request: Request) -> Adapter:
-    """Random weights in the architecture of the learned initialisations that they stand beside."""
+    """Random weights in the architecture of the learned initialisations that they are compared with."""
     family = next((each for each in LEARNED if each in request.checkpoints), None)
     trained = None if family is None else request.model(family)
     config = replace(request.configured("mv_meta"), order="file")
@@ -236,15 +236,15 @@ METHODS: dict[str, Method] = {
         for name, about in LEARNED.items()
     },
 }
-"""The methods of this package. Those with "scratch" need a number of steps; an initialisation without is optimised for
-as many as its checkpoint says."""
+"""The methods of this package. Those with "scratch" need a number of steps; an initialisation without a number is
+optimised for as many steps as its checkpoint says."""
 
 _SUFFIX = re.compile(r"(?P<base>.+)_(?P<steps>\d+|auto)")
 _SWAPPED = "_swapped"
 
 
 def find_methods() -> dict[str, Method]:
-    """All methods by name: of this package, of other packages that are installed, and their fields; with controls."""
+    """All methods by name: of this package and of other installed packages, fields of these, and swapped controls."""
     found = METHODS | load_entries("hyperplanes.methods", METHODS)
     found |= {name: _shared_weights(name, name) for name in find_targets() if name not in found}
     swapped = {
@@ -269,21 +269,21 @@ def _parse(name: str) -> tuple[str, Method, Steps | None]:
     if method is None or (method.steps == "none" and steps) or (method.steps == "required" and not steps):
         listed = ", ".join(f"{each}_N" if known[each].steps == "required" else each for each in known)
         raise ValueError(
-            f"method: expected one of {listed}, with _N or _auto after it for so many gradient steps, got {name!r}"
+            f"method: expected one of {listed}, optionally with _N or _auto after it for N gradient steps, got {name!r}"
             + did_you_mean(base, known)
         )
     return base, method, steps if steps in (None, "auto") else int(steps)
 
 
 def at_steps(name: str, steps: Sequence[int]) -> list[str]:
-    """The names of a method after each of some numbers of gradient steps; itself where it takes none.
+    """The names of a method with each of several numbers of gradient steps; its own name if it takes none.
 
     >>> at_steps("hyperplanes", [0, 10])
     ['hyperplanes', 'hyperplanes_10']
 
     Args:
-        name: without steps, or it stays alone.
-        steps: 0 is the method itself, of an initialisation its weights as they are; "scratch" has no such row.
+        name: without a number of steps; with one, it is returned unchanged.
+        steps: 0 means the method itself, or the unchanged weights of an initialisation; "scratch" skips it.
     """
     method = find_methods().get(name)
     if not steps or method is None or method.steps == "none":
@@ -318,11 +318,11 @@ def make_method(request: Request) -> Adapter:
 
 @dataclass(frozen=True)
 class WithSampler:
-    """A method whose fields are rendered by another protocol than the one they were trained by.
+    """A method whose fields are rendered by another protocol than the one they were trained with.
 
     Attributes:
         adapter: the method.
-        sampling: the protocol; None leaves all as it is. What is no field is not sampled, and stays as it is.
+        sampling: the protocol; None changes nothing. Results that are not fields take no samples and stay as they are.
     """
 
     adapter: Adapter
@@ -338,7 +338,7 @@ class WithSampler:
 
 @dataclass(frozen=True)
 class Unchecked:
-    """A method whose fine-tuning counts as it ended, even where that is an empty picture: a table hides no failure.
+    """A method whose fine-tuned fields count even if the steps ended in an empty picture, so tables hide no failure.
 
     Attributes:
         adapter: the method.

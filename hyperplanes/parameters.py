@@ -45,10 +45,10 @@ class Parameters(dict[str, Tensor]):
         return result
 
     def under(self, prefix: str) -> Parameters:
-        """The parameters of one part, named from there: "colour.bias" for "fine.colour.bias" with prefix "fine"."""
+        """The parameters of one part, without its prefix: "colour.bias" for "fine.colour.bias" with prefix "fine"."""
         start = f"{prefix}."
         return Parameters((name[len(start) :], value) for name, value in self.items() if name.startswith(start))
 
     def detach(self) -> Parameters:
-        """The same values without their history."""
+        """The same values, detached from the graph."""
         return Parameters((name, value.detach()) for name, value in self.items())

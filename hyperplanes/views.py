@@ -23,7 +23,7 @@ __all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views", "mo
 
 
 MOST = 1.5
-"""Above which numbers of a picture cannot be meant to lie in [0, 1]; what is rendered may lie a little outside."""
+"""Largest pixel value accepted as an image in [0, 1]; rendered values may overshoot slightly."""
 
 
 def check_values(name: str, values: object) -> None:
@@ -31,15 +31,15 @@ def check_values(name: str, values: object) -> None:
 
     Args:
         name: of the argument.
-        values: which should be a tensor.
+        values: what should be a tensor.
 
     Raises:
-        ValueError: something else; 0 to 255 and NaN among it.
+        ValueError: anything else, such as values from 0 to 255 or NaN.
     """
     if not isinstance(values, Tensor) or not values.is_floating_point():
-        found, hint = kind_of(values), "; torch.from_numpy(x).float() / 255 makes them of 8-bit pixels"
+        found, hint = kind_of(values), "; torch.from_numpy(x).float() / 255 converts 8-bit pixels"
         if isinstance(values, Tensor) and values.dtype == torch.bool:
-            hint = "; x.float() makes them of booleans"
+            hint = "; x.float() converts booleans"
         raise ValueError(f"{name}: expected a tensor of floating-point numbers in [0, 1], got {found}{hint}")
     if not values.numel() or values.is_meta:
         return
@@ -54,12 +54,12 @@ class Views:
     """Posed images of one scene.
 
     Attributes:
-        images: RGB in [0, 1], composited over white; (N, C, H, W) by position, as everywhere in PyTorch.
+        images: RGB in [0, 1], composited over white; shape (N, 3, H, W), as in PyTorch.
         cameras: one a view, OpenCV axes, integer pixel centres.
-        masks: opacity in [0, 1], or None where the images came without.
-        bounds: the sphere that holds all that is to be reconstructed.
+        masks: opacity in [0, 1], or None for images without masks.
+        bounds: the sphere that contains everything to be reconstructed.
         names: where each view came from, for messages and file names.
-        up: the direction that the files say is up, as `data.upright.y_up_from` takes it; None where they do not say.
+        up: the up direction stated by the files, as `data.upright.y_up_from` takes it; None where they state none.
     """
 
     images: Float[Tensor, "view 3 height width"]
@@ -140,7 +140,7 @@ class Views:
 
     @checked
     def resized(self, longest: int) -> Views:
-        """The views scaled down so that the longer side of a picture has so many pixels; smaller ones as they are."""
+        """The views scaled down so that the longer side has `longest` pixels; smaller views stay as they are."""
         if longest < 1:
             raise ValueError(f"longest: expected at least 1 pixel, got {longest}")
         scale = longest / max(self.size)
@@ -153,7 +153,7 @@ class Views:
         return self._derived(images=images, masks=masks, cameras=camera.resized(self.cameras, *size))
 
     def _derived(self, **changes: Any) -> Views:
-        """The same views with some of their parts changed together, which need not be looked at again."""
+        """The same views with some attributes replaced, which are not checked again."""
         views = object.__new__(type(self))
         views.__dict__.update({**self.__dict__, **changes})
         return views
@@ -174,16 +174,16 @@ class Views:
         among: Int[Tensor, " pixel"] | None = None,
         near_far: str = "sphere",
     ) -> tuple[Rays, Float[Tensor, "ray 3"]]:
-        """Rays through pixels drawn uniformly from all views, and the colours seen there.
+        """Rays through pixels drawn uniformly from all views, and their colours.
 
         Args:
             count: how many, drawn with replacement.
-            generator: where the randomness comes from; on the CPU, so that every device draws the same.
+            generator: on the CPU, so that every device draws the same.
             among: flat indices (view, row, column) of the pixels to draw from; all where absent.
             near_far: as in `geometry.cast`.
 
         Returns:
-            The rays and their true colours. No pixel to draw from raises ValueError.
+            The rays and their true colours. Raises ValueError if there is no pixel to draw from.
         """
         return self.sample_masked_rays(count, generator=generator, among=among, near_far=near_far)[:2]
 
@@ -196,10 +196,10 @@ class Views:
         near_far: str = "sphere",
         subpixels: Sequence[tuple[float, float]] = ((0.0, 0.0),),
     ) -> tuple[Rays, Float[Tensor, "drawn 3"], Float[Tensor, "drawn 1"]]:
-        """As `sample_rays`, with the opacity of the masks there; 1 without masks.
+        """As `sample_rays`, with the opacity of the masks; 1 without masks.
 
-        `subpixels` are places in a pixel, from its centre: there is a ray of each pixel through the first of them, then
-        one of each through the second, and so on (`Rendered.pooled`). Colours and opacities are one a pixel.
+        `subpixels` are offsets from the centre of a pixel: the rays through the first offset of every pixel come first,
+        then those through the second, and so on (`Rendered.pooled`). Each pixel has one colour and one opacity.
 
         Raises:
             ValueError: no pixel to draw from.
@@ -212,7 +212,7 @@ class Views:
             raise ValueError(f"among: expected at least one pixel of {len(self)} views to draw rays from, got none")
         flat = torch.randint(total, (count,), generator=generator).to(self.images.device)
         flat = flat if among is None else among[flat]
-        if among is not None and flat.device.type == "cpu":  # elsewhere it would be waited for
+        if among is not None and flat.device.type == "cpu":  # a GPU would have to synchronise
             check_indices(flat, len(self) * height * width, "among", f"pixels of {len(self)} views")
         return self._rays_through(flat, near_far, subpixels)
 
@@ -232,11 +232,11 @@ class Views:
             subpixels: as in `sample_masked_rays`.
 
         Returns:
-            The rays, the colours of the pixels, and the opacity of the masks there; 1 without masks. The index of no
-            pixel raises ValueError.
+            The rays, the colours of the pixels, and the opacity of the masks; 1 without masks. Raises ValueError for an
+            index out of range.
         """
         height, width = self.size
-        if pixels.device.type == "cpu":  # elsewhere it would be waited for
+        if pixels.device.type == "cpu":  # a GPU would have to synchronise
             check_indices(pixels, len(self) * height * width, "pixels", f"pixels of {len(self)} views")
         return self._rays_through(pixels, near_far, subpixels)
 
@@ -246,7 +246,7 @@ class Views:
         height, width = self.size
         view, pixel = pixels // (height * width), pixels % (height * width)
         row, column = pixel // width, pixel % width
-        places = torch.stack([column, row], -1).to(self.cameras.extrinsics)  # images may be too coarse for them
+        places = torch.stack([column, row], -1).to(self.cameras.extrinsics)  # images may have too low a precision
         places = torch.cat([places + places.new_tensor(each) for each in subpixels])
         rays = cast(self.cameras, view.repeat(len(subpixels)), places, self.bounds, near_far=near_far)
         colours = self.images[view, :, row, column]
@@ -258,7 +258,7 @@ class Views:
 
 
 def join_views(first: Views, *others: Views) -> Views:
-    """Sets of views of one scene as one; the sphere of the first counts, and masks where all have them."""
+    """Several sets of views of a scene as one, with the sphere of the first, and with masks if all have them."""
     parts = (first, *others)
     masks = [each.masks for each in parts if each.masks is not None]
     names = tuple(name for each in parts for name in each.names) if all(each.names for each in parts) else ()
@@ -284,7 +284,7 @@ def moved(views: Views, motion: Float[Tensor, "4 4"]) -> Views:
 
 @dataclass(frozen=True)
 class Task:
-    """One object: what the method is shown, and what it is judged by (HyperPlanes, Eq. 5).
+    """One object: the views that a method gets, and those that it is evaluated on (HyperPlanes, Eq. 5).
 
     Attributes:
         support: the views the method may use.
@@ -306,7 +306,7 @@ class Task:
 
 @runtime_checkable
 class Tasks(Protocol):
-    """Where tasks come from: a data set."""
+    """A data set of tasks."""
 
     def names(self, split: str) -> Sequence[str]:
         """The objects of a split."""

@@ -107,7 +107,7 @@ def test_every_method_in_words():
     words = {name: describe_method(name) for name in names}
     assert len(set(words.values())) == len(words)
     assert words["scratch_100"] == "the same field from random weights, 100 steps"
-    assert words["hyperplanes_auto"] == "HyperPlanes after as many fine-tuning steps as left-out views ask for"
+    assert words["hyperplanes_auto"] == "HyperPlanes after a number of fine-tuning steps chosen by held-out views"
 
 
 def test_a_row_for_each_number_of_steps():

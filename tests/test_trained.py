@@ -429,7 +429,7 @@ def test_a_mean_with_the_hull_is_better_than_either_and_one_by_pixel_better_stil
 def test_the_loss_of_few_rays_by_contrast_varies_less():
     """Standard deviations of 8.7e-4 by uniform draws and 4.8e-4 by contrast (25 draws of 192 rays)."""
     support, model = few(cars()[0], 12), coarse("small", side=64)
-    descent, _ = make_descent(model, model.prepare(support), FineTuning())
+    descent = make_descent(model, model.prepare(support), FineTuning())
     field, generator = descent.field(None), torch.Generator().manual_seed(0)
     by_contrast, means, spreads = contrast(support.images).flatten() + LEAST, [], []
     for importance in (torch.ones_like(by_contrast), by_contrast):

@@ -1,4 +1,4 @@
-"""The interface of every method: an adapter turns support views into a field that renders new views."""
+"""The interface of methods: an adapter turns support views into a field that renders new views."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from hyperplanes.views import Views
 
 __all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
 
-OPACITY_LOSS = 0.05  # of a ray, were all voxels that are dropped along it; with 0.3 the haze of young fields is lost
-MARGIN_LOSS = 0.9  # likewise, of those around the voxels that have density: 2.4 % in one
-POINTS = 1 << 12  # whose density one thread evaluates
+OPACITY_LOSS = 0.05  # of a ray along which all dropped voxels would lie; with 0.3 haze of young fields is lost
+MARGIN_LOSS = 0.9  # the same for voxels around those that have density: 2.4 % in one
+POINTS = 1 << 12  # per thread, for densities
 
 
 @runtime_checkable
@@ -58,16 +58,16 @@ class Adapter(Protocol):
 
 @dataclass(frozen=True)
 class AdaptedField:
-    """A field of one object with all that rendering it needs.
+    """A field of one object with everything needed to render it.
 
     Attributes:
         field: (points, directions) -> (colour, density).
-        occupancy: voxels where it can be anything but empty: the visual hull of the support masks.
+        occupancy: voxels outside of which it is empty: the visual hull of the support masks.
         sampling: the sampler that it was trained with.
-        proposal: the coarse field of `Hierarchical` sampling, where it is another one.
-        densities: points -> density alone, of the field and of its proposal.
-        refined: the voxels of `occupancy` in which it has density, where they are known.
-        symmetry: by which its views were reflected, where they were.
+        proposal: the coarse field of `Hierarchical` sampling, if it is another one.
+        densities: points -> density without colour, of the field and of its proposal.
+        refined: the voxels of `occupancy` in which it has density, if known.
+        symmetry: by which its views were reflected, if they were.
     """
 
     field: FieldFunction
@@ -84,7 +84,7 @@ class AdaptedField:
         return f"AdaptedField({self.field!r}, {self.sampling!r}, {share:.0%} of {side}^3 voxels)"
 
     def _repr_html_(self) -> str:
-        """Four pictures of the field from around it, for notebooks."""
+        """Four pictures of the field from all around, for notebooks."""
         bounds = self.occupancy.bounds
         angles = torch.arange(4) * (torch.pi / 2)
         eyes = torch.stack([angles.sin(), torch.full((4,), 0.4), angles.cos()], 1) * 3 * bounds.radius
@@ -93,7 +93,7 @@ class AdaptedField:
         return show_views(repr(self), self.render(cameras).images, cameras, bounds)
 
     def with_sampling(self, sampling: Sampler) -> AdaptedField:
-        """The same field, rendered by another sampler.
+        """The same field, rendered with another sampler.
 
         Args:
             sampling: the sampler.
@@ -101,24 +101,24 @@ class AdaptedField:
         return replace(self, sampling=sampling)
 
     def without_residuals(self) -> AdaptedField:
-        """The same field, whose pictures are not corrected (`adaptation.residuals`)."""
+        """The same field without residual correction of its pictures (`adaptation.residuals`)."""
         return self
 
     @property
     def dtype(self) -> torch.dtype:
-        """The precision in which the field expects points; single for functions that do not say."""
+        """The dtype in which the field expects points; float32 for functions without an attribute `dtype`."""
         return getattr(self.field, "dtype", torch.float32)
 
     @property
     def thread_safe(self) -> bool:
-        """Whether several threads may evaluate the field at once; as it says itself."""
+        """Whether several threads may evaluate the field at once; its attribute `thread_safe`."""
         return getattr(self.field, "thread_safe", False)
 
     @property
     def refined_occupancy(self) -> RefinedOccupancy:
-        """The voxels of `occupancy` in which the field has density; computed when they are asked for first.
+        """The voxels of `occupancy` in which the field has density; computed on first use.
 
-        They are computed again where weights of a network, or the voxels, have changed in place.
+        They are computed again if weights of a network, or the voxels, have changed in place.
         """
         if self.refined is not None:
             return self.refined
@@ -129,7 +129,7 @@ class AdaptedField:
         return refine(self.occupancy, self.density, opacity_loss=OPACITY_LOSS, margin_loss=MARGIN_LOSS)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per world unit, without colour where the field can do that."""
+        """Density per world unit, without evaluating colour if the field can do that."""
         points = as_points(points).to(self.dtype)
         if self.thread_safe and points.device.type == "cpu" and not torch.is_grad_enabled():
             return torch.cat(list(parallel_map(self._density, points.split(POINTS))))
@@ -148,18 +148,16 @@ class AdaptedField:
 
     @without_autocast
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
-        """The pixels of rays by the field's own sampler: the forward pass of training.
+        """The pixels of rays with the field's own sampler: the forward pass of training.
 
         Args:
             rays: through the scene, in any precision.
-            generator: of the places of samples; on the CPU.
-            differentiable: with gradients; else in chunks, each ray up to where it is opaque.
+            generator: of the positions of samples; on the CPU.
+            differentiable: with gradients; otherwise in chunks, with early ray termination.
         """
-        if isinstance(self.field, Field):
-            rays = rays.to(self.field.dtype)
         return render(
-            self.field, rays, self.sampling, occupancy=self.occupancy, proposal=self.proposal, generator=generator,
-            differentiable=differentiable,
+            self.field, rays.to(self.dtype), self.sampling, occupancy=self.occupancy, proposal=self.proposal,
+            generator=generator, differentiable=differentiable,
         )  # fmt: skip
 
     @checked
@@ -173,14 +171,14 @@ class AdaptedField:
         *,
         mixed_precision: bool = True,
     ) -> Pictures:
-        """The pictures of cameras, without gradients; rays and pixels in single precision, whatever the field's.
+        """The pictures of cameras, without gradients; rays and pixels in single precision, whatever that of the field.
 
         Args:
             cameras: any number, one image size, on any device and in any precision.
-            sampling: another sampler than that of the field, whose samples are denser for pictures where it marches.
-            antialias: five rays through each pixel at an edge; where absent, where it marches.
-            mixed_precision: a network of single precision may multiply numbers of bfloat16 (`Field.mixed_precision`);
-                otherwise the field decides.
+            sampling: a sampler; by default that of the field, with denser samples if it is `RayMarching`.
+            antialias: five rays through each pixel at an edge; by default for `RayMarching`.
+            mixed_precision: a float32 network may multiply in bfloat16 (`Field.mixed_precision`); otherwise the field
+                decides.
 
         Returns:
             One picture a camera, on the device of the field.
@@ -197,7 +195,7 @@ class AdaptedField:
         )
 
     def _for_pictures(self, field: FieldFunction, mixed_precision: bool) -> FieldFunction:
-        """A field as a function of single-precision points; in mixed precision, if it is a network of single one."""
+        """A field as a function of float32 points; in mixed precision, if it is a float32 network."""
         if self.dtype != torch.float32:
             cast = partial(torch.Tensor.to, dtype=self.dtype)
             return mapped(field, cast, cast, torch.Tensor.float)
@@ -205,15 +203,15 @@ class AdaptedField:
 
 
 def hull(support: Views, side: int, within: Occupancy | None = None) -> Occupancy:
-    """The visual hull of the support masks, or a full grid where there are none.
+    """The visual hull of the support masks, or a full grid without masks.
 
     Args:
         support: the views.
         side: voxels an axis.
-        within: voxels that it is known to lie in, where masks are carved.
+        within: voxels that the hull is known to lie in.
 
     Raises:
-        ValueError: masks that leave nothing.
+        ValueError: masks whose hull is empty.
     """
     if support.masks is None:
         return full(support.bounds, side, support.images.device)

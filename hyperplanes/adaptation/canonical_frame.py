@@ -22,13 +22,13 @@ from hyperplanes.views import Views
 __all__ = ["Placed", "find_rotation", "to_canonical_frame"]
 
 FOLDS = 2  # views that are held out, one at a time; a third one finds no more
-FEWEST, MOST = FOLDS, 15  # views by which a frame is looked for
-SIZE, PIXELS = 64, 1024  # of a held-out view, along its longer side, and those that are compared
-GAIN = 0.75  # dB by which a rotation must show held-out views better than none, where none will do
-FLOOR = 1e-4  # of a squared error: better views, such as empty ones, tell nothing
-MOST_PLANES = 2  # of symmetry: what has more looks alike after each rotation
+FEWEST, MOST = FOLDS, 15  # numbers of views for which a frame is looked for
+SIZE, PIXELS = 64, 1024  # pixels of a held-out view along its longer side, and pixels that are compared
+GAIN = 0.75  # dB on held-out views that a rotation must gain over none, if none is possible
+FLOOR = 1e-4  # of squared errors; smaller ones, as of empty views, say nothing
+MOST_PLANES = 2  # of symmetry: an object with more looks the same after each of the rotations
 QUARTER = math.pi / 2
-ALIGNED = math.radians(0.5)  # from which on a plane that is not across an axis is rotated to be
+ALIGNED = math.radians(0.5)  # a plane that is further from orthogonal to an axis is rotated
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Placed:
     """The views of an object in its canonical frame.
 
     Attributes:
-        views: the rotated ones.
+        views: the rotated views.
         symmetry: of the rotated object.
         rotation: from the frame of the scene.
     """
@@ -46,7 +46,7 @@ class Placed:
     rotation: Rotation
 
     def context(self, network: HyperPlanesNetwork, *, carved: bool = True) -> SupportContext:
-        """The object as `HyperPlanes.prepare` makes it of the rotated views and their reflections."""
+        """What `HyperPlanes.prepare` makes of the rotated views and their reflections."""
         return network.prepare(self.views, carved=carved, symmetry=self.symmetry)
 
     def in_scene(self, field: AdaptedField) -> AdaptedField:
@@ -55,7 +55,7 @@ class Placed:
 
 
 def to_canonical_frame(network: HyperPlanesNetwork, support: Views) -> Placed:
-    """The views of an object as a model takes them, and the symmetry by which they are reflected.
+    """The views of an object in its canonical frame, if the model looks for one, and the symmetry of the object.
 
     Args:
         network: the model.
@@ -68,10 +68,10 @@ def to_canonical_frame(network: HyperPlanesNetwork, support: Views) -> Placed:
 
 @torch.no_grad()
 def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | None) -> Rotation:
-    """The rotation after which an object stands as those of its class did in training.
+    """The rotation that aligns an object with those of its class in training.
 
-    A vertical plane of symmetry leaves four rotations: after each it is orthogonal to the x or to the z axis. After the
-    right one the model shows a view best that is held out from it.
+    A vertical plane of symmetry leaves four rotations: after each it is orthogonal to the x or to the z axis. With the
+    right one, the model renders held-out views best.
 
     Args:
         network: the model.
@@ -79,9 +79,9 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
         symmetry: of the object.
 
     Returns:
-        `config.azimuth` where that is known. Else the one of the four by which held-out views are shown best, by the
-        mean of their PSNR; where the plane is across an axis as it is, this must be by GAIN better than none. None
-        where the object has no such plane or more than MOST_PLANES, and with fewer than FEWEST views or more than MOST.
+        `config.azimuth` if that is known. Otherwise the one of the four with the highest mean PSNR on held-out views;
+        if the plane is orthogonal to an axis already, a rotation must gain at least GAIN over none. The rotation by 0
+        if the object has no such plane or more than MOST_PLANES, and with fewer than FEWEST or more than MOST views.
     """
     config = network.config
     if config.azimuth is not None:
@@ -94,7 +94,7 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
     smallest = (math.atan2(z, x) + QUARTER / 2) % QUARTER - QUARTER / 2
     smallest = smallest if abs(smallest) > ALIGNED else 0.0
     rotations = [Rotation(smallest + turns * QUARTER) for turns in range(4)]
-    # the views that are held out one after the other, the same ones after each rotation
+    # the same views are held out, one at a time, for each rotation
     views = network.to_own(support).resized(SIZE)
     placed = [Placed(each.views(views), each.symmetry(symmetry, views.bounds), each) for each in rotations]
     trials = [(each, held_out) for each in placed for held_out in range(FOLDS)]
@@ -106,7 +106,7 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
 
 
 def _quality(network: HyperPlanesNetwork, placed: Placed, held_out: int) -> float:
-    """PSNR of some pixels of a view by the field of the others; 0 where these do not show the object."""
+    """PSNR of some pixels of a view, by the field of the other views; 0 if these do not show the object."""
     views, near_far = placed.views, network.config.sampling.near_far
     shown = views[[index for index in range(len(views)) if index != held_out]]
     if shown.masks is not None and not shown.masks.any():

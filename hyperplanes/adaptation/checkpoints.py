@@ -1,4 +1,4 @@
-"""Checkpoints of models: written, found, and read again."""
+"""Checkpoints of models: writing, finding and reading them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = [
     "write_checkpoint",
 ]
 
-PACKAGED = Path(__file__).parent.parent / "pretrained"  # a folder a model, by its name
+PACKAGED = Path(__file__).parent.parent / "pretrained"  # one folder per model, named after it
 
 Model = TypeVar("Model", bound=nn.Module)
 
@@ -32,7 +32,7 @@ def write_checkpoint(folder: Path | str, config: ModelConfig, weights: Mapping[s
     """Write model.json and model.safetensors.
 
     Args:
-        folder: made where absent.
+        folder: created if absent.
         config: of the model.
         weights: by name.
     """
@@ -45,19 +45,19 @@ def read_checkpoint(name: Path | str, make: Callable[[ModelConfig], Model]) -> M
 
     Args:
         name: its folder, or the name of a packaged model.
-        make: the model of a configuration, whose weights are replaced.
+        make: makes the model of a configuration; its weights are replaced.
 
     Returns:
         The model, ready for use.
 
     Raises:
-        CheckpointError: no such folder or name, a file that is missing or damaged, or weights of another architecture
-            than the configuration says; nothing is allocated for those.
+        CheckpointError: no such folder or name, a missing or damaged file, or weights that do not fit the
+            configuration, for which nothing is allocated.
     """
     folder = checkpoint_folder(name)
     config = ModelConfig.load(folder)
     try:
-        with torch.device("meta"):  # names and shapes alone, to be compared with what the file holds
+        with torch.device("meta"):  # names and shapes alone, to compare with the file
             model = make(config)
     except ValueError as error:
         raise CheckpointError(f"{folder / 'model.json'}: {error}; train again with this version") from None
@@ -68,15 +68,15 @@ def read_checkpoint(name: Path | str, make: Callable[[ModelConfig], Model]) -> M
 
 
 def packaged_folder(name: str) -> Path:
-    """The folder of a model that comes with the package, whatever lies in the current folder."""
+    """The folder of a model that comes with the package, whatever the current folder contains."""
     return PACKAGED / name
 
 
 def checkpoint_folder(name: Path | str) -> Path:
-    """The folder of a checkpoint, of a packaged one by its name, or of one that is downloaded from the hub.
+    """The folder of a checkpoint, given by its path, the name of a packaged model, or a repository on the hub.
 
     Raises:
-        CheckpointError: a bare name that is neither a folder here nor a packaged model, or a file.
+        CheckpointError: a file, or a name that is neither a folder nor a packaged model.
     """
     folder = Path(name)
     if is_repository(str(name)):
@@ -105,7 +105,7 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
         Folders by the names of their methods, such as "hyperplanes".
 
     Raises:
-        CheckpointError: a folder that neither is nor holds a checkpoint, or two checkpoints of the same method.
+        CheckpointError: a folder without a checkpoint, or two checkpoints of the same method.
     """
     found: dict[str, Path] = {}
     for folder in map(checkpoint_folder, folders):
@@ -128,10 +128,10 @@ def find_checkpoints(folders: Sequence[Path]) -> dict[str, Path]:
 
 
 def find_checkpoint(folder: Path) -> Path:
-    """The checkpoint at a path, or of a folder of checkpoints that of HyperPlanes.
+    """The checkpoint at a path; in a folder of several, that of HyperPlanes.
 
     Raises:
-        CheckpointError: no checkpoint there, or several without a HyperPlanes among them.
+        CheckpointError: no checkpoint, or several of which none is of HyperPlanes.
     """
     found = find_checkpoints([folder])
     if "hyperplanes" not in found and len(found) > 1:

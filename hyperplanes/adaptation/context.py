@@ -1,4 +1,4 @@
-"""What adapting to an object needs of its support views, and does not depend on weights."""
+"""What adapting to an object computes from its support views, independent of weights."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from hyperplanes.views import Views
 __all__ = ["SupportContext", "arrange", "live_pixels", "observe", "prepare_context", "trained_on"]
 
 
-MOST_REFLECTED = 15  # given views, up to which gradient steps take rays of their reflections, too
+MOST_REFLECTED = 15  # given views up to which gradient steps also take rays of their reflections
 
 
 @dataclass(frozen=True)
 class SupportContext:
-    """The support side of one object, computed once.
+    """What is computed once from the support views of one object.
 
     Attributes:
-        views: the support views as the field takes them: in the order of the model's rig, one a plane, or as given.
-        planes: the same as the field looks them up; None for a field that reads no image.
+        views: the support views as the field takes them: one a plane of the model's rig, or as given.
+        planes: the views in the form in which the field looks colours up; None for a field that reads no image.
         occupancy: the visual hull of all support masks.
         hyperplanes: indices of the views that the hypernetwork reads.
-        volume: what the planes show on a grid over the scene, for a hypernetwork that reads it.
-        symmetry: of the object, by which the views after the first ones are reflections of these
-            (`reflections.images_by`); None where all of them are views that were given.
+        volume: the planes resampled on a grid over the scene, for a hypernetwork that reads it.
+        symmetry: of the object; the views are then followed by their reflections (`reflections.images_by`). None if all
+            views were given.
     """
 
     views: Views
@@ -56,7 +56,7 @@ class SupportContext:
         return self.views if self.symmetry is None else self.views[: len(self.views) // self.symmetry.images]
 
     def mask_views(self, views: Int[Tensor, " masked"]) -> SupportContext:
-        """The same object, of which some views show the field nothing.
+        """The same object with some views masked, so that the field sees nothing in them.
 
         Args:
             views: their indices.
@@ -86,23 +86,23 @@ def prepare_context(
     masks_repeated: bool = False,
     symmetry: Symmetry | None = None,
 ) -> SupportContext:
-    """The support side of one object.
+    """The support context of one object.
 
     Args:
         support: the views, where the weights are.
         target: the network that looks colours up in them.
-        rig: where its planes stand.
-        hypernetwork: what reads some of them, if there is one.
+        rig: camera directions of its planes.
+        hypernetwork: if there is one.
         hull_resolution: voxels an axis of the visual hull, at least.
-        carved: without, one voxel that may hold anything stands for the hull; a hypernetwork that reads the hull has it
-            carved in any case.
-        masks_repeated: where there are fewer views than planes, each view is shown at one plane alone.
-        symmetry: of the object: reflections of the views count as views, too.
+        carved: if False, a single occupied voxel replaces the hull. For a hypernetwork that reads the hull it is carved
+            in any case.
+        masks_repeated: if there are fewer views than planes, show each view at one plane and mask the others.
+        symmetry: of the object, whose views are then followed by their reflections.
     """
     given, support = len(support), with_reflections(support, symmetry)
     views, device = arrange(support, target, rig), support.images.device
 
-    # the visual hull, of all views and not only of those that are planes
+    # the visual hull of all views, not only of those that become planes
     reads_volume = hypernetwork is not None and hypernetwork.reads_volume
     if carved or reads_volume:
         occupancy = hull(support, target.hull_resolution(hull_resolution, support))
@@ -128,11 +128,11 @@ def prepare_context(
 
 
 def observe(contexts: Sequence[SupportContext], resolution: int = 0) -> Observed:
-    """What a hypernetwork reads of some objects, in one batch (HyperPlanes, Eq. 7: I_1..I_k and d_1..d_k).
+    """The inputs of a hypernetwork for a batch of objects (HyperPlanes, Eq. 7: I_1..I_k and d_1..d_k).
 
     Args:
-        contexts: the objects; they may have different numbers of HyperPlanes, and pictures of different sizes.
-        resolution: pixels a side that pictures are resized to; 0 takes the size of the first object's.
+        contexts: the objects; they may have different numbers of HyperPlanes, and images of different sizes.
+        resolution: pixels a side that images are resized to; 0 takes the size of the first object's images.
     """
     if contexts[0].volume is not None:
         return Observed(volume=torch.stack([each.volume for each in contexts if each.volume is not None]))
@@ -140,19 +140,20 @@ def observe(contexts: Sequence[SupportContext], resolution: int = 0) -> Observed
     directions = [camera.viewing_directions(each.cameras) for each in read]
     size = (resolution, resolution) if resolution else read[0].size
     images = [_resized(each.images, size) for each in read]
-    # objects of fewer HyperPlanes are padded with zeros, which `present` says are no images
+    # objects with fewer HyperPlanes are padded with zeros, which are marked in `present`
     present = [torch.ones(len(each), dtype=torch.bool, device=each.device) for each in directions]
     return Observed(*(pad_sequence(part, batch_first=True) for part in (images, directions, present)))
 
 
 def trained_on(context: SupportContext, support: Views) -> Views:
-    """Where rays come from: the support views, in their order, or a few and their reflections about one plane.
+    """The views that rays are drawn from: the support views, with their reflections about one plane if they are few.
 
-    Rays of reflections about several planes show 0.3 dB less (17 lamps from 3 and 5 views, 100 steps). Many views show
-    an object well enough, and what is not quite symmetric would be learned wrongly (docs/image-based-measurements.md).
+    With reflections about several planes PSNR is 0.3 dB lower (17 lamps from 3 and 5 views, 100 steps). Many views show
+    an object well enough, and wherever it is not quite symmetric, reflections are wrong
+    (docs/image-based-measurements.md).
 
     Args:
-        context: of the object.
+        context: the object.
         support: the views, without reflections.
     """
     few = context.symmetry is not None and len(support) <= MOST_REFLECTED
@@ -160,10 +161,10 @@ def trained_on(context: SupportContext, support: Views) -> Views:
 
 
 def live_pixels(occupancy: Occupancy, views: Views) -> Int[Tensor, " pixel"]:
-    """Flat indices (view, row, column) of the pixels whose rays meet something."""
+    """Flat indices (view, row, column) of the pixels whose rays meet an occupied voxel."""
     return footprint(occupancy, views.cameras).flatten().nonzero()[:, 0]
 
 
 def _resized(images: Float[Tensor, "view 3 height width"], size: tuple[int, int]) -> Tensor:
-    """Images of that size, by the mean of the pixels that one covers where there are more."""
+    """Images resized to `size`, by averaging areas."""
     return images if images.shape[2:] == size else torch.nn.functional.interpolate(images, size, mode="area")

@@ -1,14 +1,13 @@
-"""Gradient descent on the support views of one object: fine-tuning, from random weights, learned initialisations.
+"""Gradient descent on the support views of one object, from trained, random or meta-learned weights.
 
-All of them are the same loop (`Descent.run`): a field is made of some variables, rays of the support views are rendered
-by it, and the variables follow the gradient of the squared error (HyperPlanes, section 3, fine-tuning).
+All share one loop (`Descent.run`): a field is made from some variables, rays of the support views are rendered, and the
+variables follow the gradient of the squared error (HyperPlanes, section 3, fine-tuning).
 """
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,25 +19,24 @@ from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.optimisers import make_optimisers
 from hyperplanes.configuration.fine_tuning import RATES, FineTuning
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.hypernetwork import HyperNetwork
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.views import Views
 
-__all__ = ["Descent", "Variables", "contrast", "draw_pixels", "pixels_of", "ray_loss", "split_holdout"]
+__all__ = ["Descent", "contrast", "draw_pixels", "pixels_of", "ray_loss", "split_holdout"]
 
-HOLDOUT_RAYS = 4096  # of held-out views that "auto" compares
-PART = 512  # rays of a step whose gradients one thread finds, at most
-CHECKS = 10  # times that it compares them
-LEAST = 0.05  # importance of a pixel without contrast, which is added to that of all
+HOLDOUT_RAYS = 4096  # of held-out views, on which "auto" compares numbers of steps
+PART = 512  # rays of a step whose gradients one thread computes, at most
+CHECKS = 10  # of "auto" along the schedule
+LEAST = 0.05  # added to the contrast of all pixels
 
 
 def ray_loss(seen: Rendered, truth: Tensor, weights: Tensor | float = 1.0) -> Tensor:
-    """Mean squared error of the colours of rays, that of the coarse pass added where there was one (Eq. 2).
+    """Mean squared error of the colours of rays, plus that of the coarse pass if there is one (Eq. 2).
 
     Args:
-        seen: the rays.
-        truth: their colours (ray, 3).
+        seen: the rendered rays.
+        truth: their true colours (ray, 3).
         weights: of each ray (ray, 1).
     """
     loss = (weights * (seen.colour - truth).square()).mean()
@@ -46,7 +44,7 @@ def ray_loss(seen: Rendered, truth: Tensor, weights: Tensor | float = 1.0) -> Te
 
 
 def contrast(images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view height width"]:
-    """The range of the values among the 3x3 pixels around each, the mean over the channels.
+    """The range of values in the 3x3 pixels around each pixel, averaged over channels.
 
     >>> contrast(torch.tensor([0.0, 0.0, 0.0, 0.6]).expand(1, 3, 1, 4))
     tensor([[[0.0000, 0.0000, 0.6000, 0.6000]]])
@@ -57,12 +55,12 @@ def contrast(images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "vie
     Returns:
         In [0, 1], for each pixel.
     """
-    # view by view, which stays in the caches: 19 ms for 50 views of 200x200, where `max_pool2d` takes 400 (one thread)
+    # view by view, to stay in cache: 19 ms for 50 views of 200x200, where `max_pool2d` takes 400 (one thread)
     return torch.stack([(_local_maximum(view) + _local_maximum(-view)).mean(0) for view in images])
 
 
 def _local_maximum(values: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel height width"]:
-    """The largest value among the 3x3 pixels around each."""
+    """The largest value in the 3x3 pixels around each pixel."""
     for axis, size in ((1, values.shape[1]), (2, values.shape[2])):
         first, last = values.narrow(axis, 0, 1), values.narrow(axis, size - 1, 1)
         padded = torch.cat([first, values, last], axis)
@@ -73,19 +71,19 @@ def _local_maximum(values: Float[Tensor, "channel height width"]) -> Float[Tenso
 def draw_pixels(
     importance: Float[Tensor, " pixel"], among: Int[Tensor, " some"] | None, count: int, generator: torch.Generator
 ) -> tuple[Int[Tensor, " drawn"], Float[Tensor, "drawn 1"]]:
-    """Pixels drawn in proportion to an importance, and the weights by which their mean is that over all pixels.
+    """Pixels drawn in proportion to an importance, and weights that make their mean unbiased.
 
-    This is importance sampling (Kahn & Marshall 1953). The closer the importance is to the error, the less the loss of
-    few rays varies (`tests/test_trained.py`).
+    This is importance sampling (Kahn & Marshall 1953). The closer the importance is to the error, the lower the
+    variance of the loss (`tests/test_trained.py`).
 
     Args:
         importance: above 0.
-        among: indices of the pixels to draw from; all where None.
+        among: indices of the pixels to draw from; all if None.
         count: how many, drawn with replacement.
         generator: on the CPU.
 
     Returns:
-        Their indices and weights. The weights of uniform draws are 1.
+        Their indices and weights; weights are 1 if the importance is constant.
 
     Raises:
         ValueError: no pixel to draw from.
@@ -101,53 +99,22 @@ def draw_pixels(
 
 
 @dataclass(frozen=True)
-class Variables:
-    """What a descent optimises, and the weights of the field that it makes.
-
-    Attributes:
-        tensors: optimised in place.
-        weights: the parameters of the field, as a function of the tensors as they are now.
-    """
-
-    tensors: Sequence[Tensor]
-    weights: Callable[[], Parameters]
-
-    @classmethod
-    def of_weights(cls, start: Mapping[str, Tensor]) -> Variables:
-        """The weights themselves, copied from where the descent begins."""
-        trainable = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
-        return cls(list(trainable.values()), lambda: trainable if torch.is_grad_enabled() else trainable.detach())
-
-    @classmethod
-    def of_hypernetwork(
-        cls, hypernetwork: HyperNetwork, theta: Parameters, update: Callable[[HyperNetwork], Parameters]
-    ) -> Variables:
-        """A copy of a hypernetwork whose update is added to frozen weights, as in the paper.
-
-        Args:
-            hypernetwork: stays as it is.
-            theta: the frozen weights.
-            update: that a hypernetwork makes of the object.
-        """
-        tuned = copy.deepcopy(hypernetwork).eval().requires_grad_(True)
-        return cls([*tuned.parameters()], lambda: theta + update(tuned))
-
-
-@dataclass(frozen=True)
 class Descent:
     """A descent on the squared error of rays of support views.
 
     Attributes:
-        field: the field that the variables make now, to which the views of these indices, if any, are not shown.
-        tensors: what is optimised, in place.
-        views: where rays and their colours come from.
+        field: makes the field of the current tensors, with the views of the given indices masked.
+        tensors: optimised in place.
+        weights: makes the parameters of the field of the current tensors.
+        views: the views that rays and their colours are drawn from.
         settings: rays, rates and seed; a `draw` of None is uniform.
-        pixels: flat indices (view, row, column) of `views` to draw from, ascending; all where None.
-        masks_views: mask the views that the rays of a step come from, as `settings.mask_views` says.
+        pixels: flat indices (view, row, column) of `views` to draw from, ascending; all if None.
+        masks_views: whether the views that the rays of a step come from may be masked, as `settings.mask_views` says.
     """
 
     field: Callable[[Int[Tensor, " masked"] | None], AdaptedField]
     tensors: Sequence[Tensor]
+    weights: Callable[[], Parameters]
     views: Views
     settings: FineTuning
     pixels: Int[Tensor, " pixel"] | None = None
@@ -160,7 +127,7 @@ class Descent:
             steps: length of the schedule of the rates.
 
         Yields:
-            The number of steps done: 0, and after each step of the schedule one more.
+            The number of steps done: 0, then one more after each step.
         """
         settings, views = self.settings, self.views
         name, adam, muon = RATES[settings.trainable]
@@ -178,10 +145,10 @@ class Descent:
         yield 0
         for step in range(steps):
             with torch.enable_grad():
-                # the views that this step's rays come from, which the field is not shown
+                # the views that this step's rays come from are masked
                 masked = self._draw_views(generator) if masks_views else None
                 among = self.pixels if masked is None else pixels_of(masked, views, self.pixels)
-                # the field of the variables as they are now, and how far its rays are from the truth
+                # the current field, and the gradients of the error of its rays
                 field = self.field(masked)
                 near_far, weights = field.sampling.near_far, None
                 if importance is None:
@@ -190,7 +157,7 @@ class Descent:
                     drawn, weights = draw_pixels(importance, among, settings.rays, generator)
                     rays, truth, _ = views.rays_at(drawn, near_far=near_far)
                 gradients = self._gradients(field, rays, truth, generator, weights)
-                # one step of every optimiser, at the rate of the schedule
+                # one step of each optimiser, at the scheduled rate
                 for tensor, gradient in zip(self.tensors, gradients, strict=True):
                     tensor.grad = gradient
                 for optimiser, rate in zip(optimisers, rates, strict=True):
@@ -206,8 +173,8 @@ class Descent:
         generator: torch.Generator,
         weights: Tensor | None = None,
     ) -> Sequence[Tensor | None]:
-        """The gradients of the mean loss of rays, parts of which have a thread and a generator each."""
-        # the graph of a hypernetwork is one for all rays
+        """The gradients of the mean loss of rays, split into parts with one thread and one generator each."""
+        # with a hypernetwork all rays share its graph
         size = PART if self.settings.trainable == "weights" and truth.device.type == "cpu" else len(rays)
         starts = range(0, len(rays), size)
         generators = [generator]
@@ -225,7 +192,7 @@ class Descent:
 
     @torch.no_grad()
     def errors(self) -> tuple[float, float]:
-        """Squared errors on the same `settings.rays` rays of the views: of the field as it is, of an empty picture."""
+        """Squared errors on the same `settings.rays` rays of the views: of the current field and an empty picture."""
         field, generator = self.field(None), torch.Generator().manual_seed(self.settings.seed + 2)
         near_far = field.sampling.near_far
         rays, truth = self.views.sample_rays(
@@ -244,22 +211,22 @@ class Descent:
         pixels: Int[Tensor, " pixel"] | None = None,
         on_step: Callable[[int], None] | None = None,
     ) -> int:
-        """After how many of `settings.max_steps` steps the field shows held-out views best; 0 for none.
+        """The number of steps, up to `settings.max_steps`, after which the error on held-out views is least.
 
-        Judged on the squared error of the same HOLDOUT_RAYS rays at 0 steps and at every CHECKS-th part of the
-        schedule; ends early after three checks without improvement.
+        The squared error of the same HOLDOUT_RAYS rays is compared at 0 steps and CHECKS times along the schedule.
+        It ends early after three checks without improvement.
 
         Args:
-            holdout: the views that decide.
-            unchanged: the field of no step, where that is another one than the descent begins with.
-            beside: a field with which pictures are averaged, if any.
-            share: of that.
-            pixels: flat indices of their pixels that count.
+            holdout: the held-out views.
+            unchanged: the field of 0 steps, if that is not the one that the descent begins with.
+            beside: a field that pictures are averaged with, if any.
+            share: of `beside` in the average.
+            pixels: flat indices of the pixels of `holdout` to draw rays from.
             on_step: called with the number of steps done, before the first and after each.
         """
         most = self.settings.max_steps
         generator = torch.Generator().manual_seed(self.settings.seed + 1)
-        # the rays that judge, the same at every check
+        # the rays that fields are compared on, the same at every check
         with torch.no_grad():
             near_far = self.field(None).sampling.near_far
             rays, truth = holdout.sample_rays(HOLDOUT_RAYS, generator=generator, among=pixels, near_far=near_far)
@@ -286,7 +253,7 @@ class Descent:
         return best
 
     def _draw_views(self, generator: torch.Generator) -> Int[Tensor, " masked"]:
-        """The views that a step draws rays from, among those that have a pixel to draw."""
+        """The views that a step draws rays from, among those with a pixel to draw from."""
         drawn = torch.randperm(len(self.views), generator=generator).to(self.views.images.device)
         if self.pixels is not None:
             area = self.views.size[0] * self.views.size[1]
@@ -296,12 +263,12 @@ class Descent:
 
 
 def pixels_of(chosen: Int[Tensor, " chosen"], views: Views, pixels: Int[Tensor, " pixel"] | None) -> Tensor:
-    """Flat indices (view, row, column) of the pixels of some views: all of them, or those among given ones.
+    """Flat indices (view, row, column) of the pixels of some views: all of them, or those among `pixels`.
 
     Args:
         chosen: indices of the views.
         views: all of them.
-        pixels: flat indices, ascending; all where None.
+        pixels: flat indices, ascending; all if None.
     """
     area = views.size[0] * views.size[1]
     if pixels is None:
@@ -311,7 +278,7 @@ def pixels_of(chosen: Int[Tensor, " chosen"], views: Views, pixels: Int[Tensor, 
 
 
 def split_holdout(support: Views, settings: FineTuning) -> tuple[Views, Views]:
-    """The views that are shown while "auto" chooses the number of steps, and those that decide it.
+    """The views that "auto" fine-tunes on while it chooses the number of steps, and the held-out ones.
 
     Raises:
         ValueError: fewer than 3 views.

@@ -1,4 +1,4 @@
-"""Does the update depend on the object? The diagnostics of a hypernetwork."""
+"""Diagnostics of a hypernetwork: does the update depend on the object?"""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from hyperplanes.views import Views
 __all__ = ["SMALLEST_SPREAD", "Diagnostics", "diagnose", "swap_gap"]
 
 SMALLEST_SPREAD = 0.01
-"""Of the norm of the updates: below it they are the same for every object, and training warns."""
+"""`Diagnostics.spread` below which updates are practically the same for every object, and training warns."""
 
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What the updates of several objects have in common and what they have not.
+    """How much the updates of several objects differ.
 
     Attributes:
-        active: share of the units, of the codes where they have an activation and of the head, whose activation has a
+        active: share of the units (of the head, and of the codes if they have an activation) whose activation has a
             positive argument for at least one object.
         norm: root mean square over objects of the norm of delta theta.
         spread: root mean square distance of the updates from their mean over objects, as a fraction of `norm`.
         swap_gap: PSNR with an object's own update minus PSNR with the update of another object, in dB, mean over
-            objects; NaN where it was not measured.
+            objects; NaN if it was not measured.
     """
 
     active: float
@@ -56,7 +56,7 @@ class Diagnostics:
         """What `as_json` returned.
 
         Raises:
-            CheckpointError: an entry that is missing or is no number.
+            CheckpointError: an entry that is missing or not a number.
         """
         names = ("active", "norm", "spread")
         found = {name: value.get(name) for name in (*names, "swap_gap") if name in names or name in value}
@@ -76,10 +76,10 @@ class Diagnostics:
 
 @torch.no_grad()
 def diagnose(model: HyperPlanes, prepared: Sequence[SupportContext]) -> Diagnostics:
-    """Norm and spread of the updates of some objects, and the activity of the head's units.
+    """Norm and spread of the updates of some objects, and the share of active units.
 
     Args:
-        model: with a hypernetwork; left in the mode it is in.
+        model: with a hypernetwork; its mode is kept.
         prepared: at least two objects.
 
     Returns:
@@ -91,7 +91,7 @@ def diagnose(model: HyperPlanes, prepared: Sequence[SupportContext]) -> Diagnost
     if model.hypernetwork is None or len(prepared) < 2:
         what = "a model without one" if model.hypernetwork is None else f"{len(prepared)} objects"
         raise ValueError(f"diagnose: expected a hypernetwork and at least 2 objects, got {what}")
-    # which units of the head any object activates, seen while the updates are made
+    # which units any object activates, recorded while the updates are computed
     active: list[Tensor] = []
     hooks = [
         layer.register_forward_hook(lambda module, inputs, output: active.append((output > 0).any(0).flatten()))
@@ -115,13 +115,13 @@ def diagnose(model: HyperPlanes, prepared: Sequence[SupportContext]) -> Diagnost
 def swap_gap(
     model: HyperPlanes, prepared: Sequence[SupportContext], queries: Sequence[Views], own: float | None = None
 ) -> float:
-    """What the update of the next object costs, in dB of the PSNR of query views.
+    """The PSNR of query views that is lost with the update of another object, the next one, in dB.
 
     Args:
         model: with a hypernetwork, in evaluation mode.
         prepared: the objects.
-        queries: views of each, to compare with.
-        own: the PSNR with each object's own update, where it is known.
+        queries: views of each object to compare with.
+        own: the mean PSNR with each object's own update, if known.
 
     Returns:
         Mean PSNR over all views with each object's own update, minus that with the next one's.

@@ -1,4 +1,4 @@
-"""The symmetry by which a model is shown reflections of an object's views."""
+"""The symmetry by which the views of an object are reflected for a model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hyperplanes.views import Views
 
 __all__ = ["find_symmetry"]
 
-SIZE, PIXELS = 128, 2048  # along the longer side of a single view, and those by which it is judged
+SIZE, PIXELS = 128, 2048  # pixels of a single view along its longer side, and pixels that are compared
 
 
 @torch.no_grad()
@@ -30,9 +30,9 @@ def find_symmetry(network: HyperPlanesNetwork, support: Views) -> Symmetry | Non
 
 
 def _of_one_view(network: HyperPlanesNetwork, view: Views) -> Symmetry | None:
-    """Several planes where the view shows them; else the plane by which it is shown best, if not without a reflection.
+    """Several planes if the view shows them; otherwise the plane, or None, with which the model renders it best.
 
-    The model itself shows a view with few planes: with many, the view is what the hull is made of.
+    A single plane is judged by the model's own rendering of the view; several are judged by the visual hull alone.
     """
     if view.masks is None or not view.masks.any():
         return None

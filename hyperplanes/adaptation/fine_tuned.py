@@ -1,4 +1,4 @@
-"""Methods that take gradient steps on the support views of every object, from trained weights and from random ones."""
+"""Methods that take gradient steps on the support views of each object, from trained or from random weights."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from hyperplanes.views import Views
 __all__ = ["SCRATCH_RATES", "FieldFromScratch", "FineTuned", "FromScratch", "random_model", "shuffled"]
 
 SCRATCH_RATES = {"learning_rate": 4e-3, "muon_learning_rate": 0.05}
-"""Of Adam and of Muon from random weights: higher than those of fine-tuning, docs/adaptation.md; a field may have its
-own (`Target.fine_tuning_rates`)."""
+"""Of Adam and Muon from random weights: higher than those of fine-tuning (docs/adaptation.md). A field may have its own
+(`Target.fine_tuning_rates`)."""
 
 
 @dataclass(frozen=True)
 class FineTuned:
-    """A model that is fine-tuned on the support views of every object.
+    """A model that is fine-tuned on the support views of each object.
 
     Attributes:
         model: never changed.
-        steps: of fine-tuning an object, or "auto".
+        steps: on each object, or "auto".
         settings: of fine-tuning.
     """
 
@@ -43,15 +43,15 @@ class FineTuned:
 
 @dataclass(frozen=True)
 class FromScratch:
-    """The target network of a model, optimised on the support views of every object from random weights.
+    """The target network of a model, optimised on the support views of each object from random weights.
 
-    The control of fine-tuning: the same field, planes, rays and number of steps, without what training has learned.
+    A control for fine-tuning: the same field, planes, rays and number of steps, without what training has learned.
 
     Attributes:
-        model: whose architecture and rig are used; its weights are not.
-        steps: of optimising an object, or "auto".
-        settings: of the optimisation; rates that it does not state are those of SCRATCH_RATES. Its seed is that of the
-            random weights, too, and all weights are trained.
+        model: whose architecture and rig are used, but not its weights.
+        steps: on each object, or "auto".
+        settings: of the optimisation. Rates that are None become SCRATCH_RATES, the seed is also that of the random
+            weights, and all weights are trained.
     """
 
     model: HyperPlanes
@@ -60,7 +60,7 @@ class FromScratch:
 
     @checked
     def adapt(self, support: Views) -> AdaptedField:
-        """The field after so many steps from random weights; views are reflected about the plane of the model."""
+        """The field after the steps; the views are reflected by the symmetry that the model finds."""
         symmetry = self.model.find_symmetry(support)
         fresh = random_model(replace(self.model.config, symmetric=False, symmetry=symmetry), self.settings.seed)
         fresh.rig.copy_(self.model.rig)
@@ -70,15 +70,15 @@ class FromScratch:
 
 @dataclass(frozen=True)
 class FieldFromScratch:
-    """A target network of its own for every object, optimised on its support views from random weights.
+    """A target network for each object, optimised on its support views from random weights.
 
-    No checkpoint is needed: there is one ImagePlane a support view, in the order of the views.
+    No checkpoint is needed: each support view is an ImagePlane, in the order of the views.
 
     Attributes:
-        config: which field, of which shape; its number of planes counts for fields that take any number of views.
-        steps: of optimising an object, or "auto".
-        settings: as those of `FromScratch`.
-        device: where to compute.
+        config: of the field; its number of planes is used only for fields that take any number of views.
+        steps: on each object, or "auto".
+        settings: as in `FromScratch`.
+        device: of the field.
     """
 
     config: ModelConfig
@@ -88,7 +88,7 @@ class FieldFromScratch:
 
     @checked
     def adapt(self, support: Views) -> AdaptedField:
-        """The field after so many steps from random weights."""
+        """The field after the steps."""
         planes = (
             self.config.network.planes if find_targets()[self.config.target].permutation_invariant else len(support)
         )
@@ -99,23 +99,23 @@ class FieldFromScratch:
 
 
 def random_model(config: ModelConfig, seed: int) -> HyperPlanes:
-    """The target network of a model with random weights, without what finds better ones."""
+    """The target network of a model alone, with random weights."""
     return HyperPlanes(config.target_alone(), seed=seed)
 
 
 def _rated(settings: FineTuning, model: HyperPlanes) -> FineTuning:
-    """The settings of all weights and, where they state no rate, those from random weights."""
+    """The settings for training all weights, with the rates for random weights where they state none."""
     return replace(settings, trainable="weights").with_rates(model.target.fine_tuning_rates or SCRATCH_RATES)
 
 
 @torch.no_grad()
 def shuffled(model: HyperPlanes, seed: int = 0) -> HyperPlanes:
-    """The model with the entries of every weight matrix and of every bias in random order ("Shuffled" there).
+    """The model with the entries of each weight matrix and bias in random order ("Shuffled" in Tancik et al. 2021).
 
-    Each keeps its mean and its variance and loses everything else that was learned.
+    Each keeps its mean and variance and loses everything else that was learned.
 
     Args:
-        model: left as it is.
+        model: not changed.
         seed: of the order.
     """
     result = copy.deepcopy(model)

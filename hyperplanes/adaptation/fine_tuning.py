@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +14,7 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.context import SupportContext, observe, trained_on
-from hyperplanes.adaptation.descent import Descent, Variables, split_holdout
+from hyperplanes.adaptation.descent import Descent, split_holdout
 from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.stacking import stacked_field, tuned_field
@@ -34,14 +35,14 @@ __all__ = [
 
 Made = TypeVar("Made")
 
-NEARLY = 0.99  # of the error of an empty picture, which a field that has lost everything may miss by rounding
+NEARLY = 0.99  # of the error of an empty picture, which rounding may change for a field that has lost everything
 
 
 class NoProgressError(ValueError):
-    """Gradient steps that end neither below the error before them nor below that of an empty picture.
+    """Gradient steps whose final error is below neither the initial one nor that of an empty picture.
 
     Attributes:
-        field: what they made all the same; None where its error is no number.
+        field: the field after the steps; None if its error is not finite.
     """
 
     def __init__(self, message: str, field: AdaptedField | None = None) -> None:
@@ -50,13 +51,13 @@ class NoProgressError(ValueError):
 
 
 def made_anyway(make: Callable[[], Made]) -> Made | AdaptedField:
-    """What gradient steps made, even where they lowered nothing.
+    """The field after gradient steps, even if they made no progress.
 
     Args:
-        make: takes them.
+        make: takes the steps.
 
     Raises:
-        NoProgressError: they ended in no numbers.
+        NoProgressError: their error is not finite.
     """
     try:
         return make()
@@ -83,27 +84,27 @@ def fine_tune(
         steps: gradient steps, or "auto".
         settings: what is optimised, rates, rays and seed.
         on_step: called with the number of steps done.
-        on_trial: likewise, while "auto" finds how many they are to be.
+        on_trial: the same for the trial steps of "auto".
     """
     support, settings = network.to_own(support), settings or FineTuning()
     check_fine_tuning(settings, steps, len(support), network.config, network.target)
     if steps != "auto":
         return _fine_tune_in_frame(network, support, steps, settings, None, on_step)
 
-    # how many steps show some of the views best that the others were fine-tuned without, from as many random weights
+    # the number of steps that is best for held-out views, with the share of random weights for all views
     settings = settings.for_views(len(support), network.target.permutation_invariant)
     shown, holdout = split_holdout(support, settings)
     placed = to_canonical_frame(network, shown)
     holdout = placed.rotation.views(holdout)
     context = placed.context(network)
-    trial, variables = make_descent(network, context, settings, trained_on(context, placed.views))
+    trial = make_descent(network, context, settings, trained_on(context, placed.views))
     pixels = network.live_pixels_of(context, holdout)
     unchanged = network.field(context, updated_weights(network, context))
-    before, share = average_of(network, context, settings, variables)
+    before, share = average_of(network, context, settings, trial)
     beside = None if before is None else network.field(context, before)
     stop = trial.best_stop(holdout, unchanged=unchanged, beside=beside, share=share, pixels=pixels, on_step=on_trial)
 
-    # as many steps on all of them, by the same schedule
+    # as many steps on all views, with the same schedule
     return _fine_tune_in_frame(network, support, stop, settings, settings.max_steps, on_step)
 
 
@@ -115,7 +116,7 @@ def _fine_tune_in_frame(
     schedule: int | None,
     on_step: Callable[[int], None] | None,
 ) -> AdaptedField:
-    """As `fine_tune_to`, of an object that is rotated into its canonical frame for that."""
+    """As `fine_tune_to`, with the object rotated into its canonical frame."""
     placed = to_canonical_frame(network, support)
     context = placed.context(network)
     views = trained_on(context, placed.views)
@@ -150,28 +151,28 @@ def fine_tune_to(
     schedule: int | None = None,
     on_step: Callable[[int], None] | None = None,
 ) -> AdaptedField:
-    """As `fine_tune`, of an object that is prepared.
+    """As `fine_tune`, of a prepared object.
 
     Args:
         network: the model.
         context: the object.
-        steps: taken.
+        steps: number of steps.
         settings: as in `fine_tune`.
-        views: where rays come from; those of the planes where absent.
-        schedule: the number of steps in which the rates fall; `steps` where absent.
+        views: the views that rays are drawn from; by default those of the context.
+        schedule: the number of steps over which the rates fall; by default `steps`.
         on_step: as in `fine_tune`.
 
     Raises:
-        NoProgressError: the steps lowered nothing: wild rates end in pictures that are empty, or in no numbers.
+        NoProgressError: the steps did not lower the error: too high rates end in empty pictures, or in NaN.
     """
-    check_fine_tuning(settings, steps, len(views or context.views), network.config, network.target)
+    check_fine_tuning(settings, steps, len(context.given), network.config, network.target)
     if not steps:
         if on_step is not None:
             on_step(0)
         with torch.no_grad():
             return stacked_field(network, context, updated_weights(network, context))
-    descent, variables = make_descent(network, context, settings, views)
-    average = average_of(network, context, settings, variables)
+    descent = make_descent(network, context, settings, views)
+    average = average_of(network, context, settings, descent)
     before, _ = descent.errors()
     for done in descent.run(steps if schedule is None else schedule):
         if on_step is not None:
@@ -180,7 +181,7 @@ def fine_tune_to(
             break
     after, empty = descent.errors()
     with torch.no_grad():
-        made = tuned_field(network, context, variables.weights(), *average)
+        made = tuned_field(network, context, descent.weights(), *average)
     if not after < max(before, empty * NEARLY):
         raise NoProgressError(
             f"fine-tuning: expected {steps} steps to lower the squared error, {before:.3g}, got {after:.3g}, where an "
@@ -191,27 +192,27 @@ def fine_tune_to(
 
 
 def average_of(
-    network: HyperPlanesNetwork, context: SupportContext, settings: FineTuning, variables: Variables
+    network: HyperPlanesNetwork, context: SupportContext, settings: FineTuning, descent: Descent
 ) -> tuple[Parameters | None, float]:
-    """The weights of the field that pictures after gradient steps are averaged with, and its share in them.
+    """The weights of the field that pictures after gradient steps are averaged with, and its share.
 
-    They are those that the steps begin with, or, where the model is what others made of one object, those before these.
+    They are the initial weights of the steps or, if the model was made by earlier steps on one object, of those.
 
     Args:
         network: the model.
         context: the object.
         settings: as in `fine_tune`.
-        variables: of `make_descent`, before the first step.
+        descent: before its first step.
 
     Returns:
-        None and 0 where pictures are those after the steps alone.
+        None and 0 if pictures are not averaged.
     """
     if network.theta_before is not None:
         return network.theta_before, network.config.average
     share = settings.average_share(len(context.given))
     if not share or not network.reads_volume:
         return None, 0.0
-    return Parameters((name, value.detach().clone()) for name, value in variables.weights().items()), share
+    return Parameters((name, value.detach().clone()) for name, value in descent.weights().items()), share
 
 
 def make_descent(
@@ -220,47 +221,49 @@ def make_descent(
     settings: FineTuning,
     views: Views | None = None,
     start: Parameters | None = None,
-) -> tuple[Descent, Variables]:
-    """Gradient descent on rays of an object's views: what fine-tuning and learned initialisations do.
+) -> Descent:
+    """Gradient descent on rays of the views of an object, for fine-tuning and learned initialisations.
 
     Args:
         network: the model.
         context: the object.
         settings: what is optimised, rates, rays and seed.
-        views: where rays come from; those of the planes where absent.
-        start: the weights to begin with; those of `adapt` where absent.
+        views: the views that rays are drawn from; by default those of the context.
+        start: the initial weights; by default those of `adapt`.
     """
     views, any_views = context.views if views is None else views, network.target.permutation_invariant
     settings = settings.for_views(len(context.given), any_views)
-    if start is not None:  # which keeps its shape
+    if start is not None:  # the grid keeps its shape
         settings = replace(settings, cells=0)
     if settings.trainable == "weights":
         settings = settings.with_rates(network.target.fine_tuning_rates)
-    variables = _variables(network, context, settings, start)
+    tensors, weights = _variables(network, context, settings, start)
 
     def field(masked: Tensor | None) -> AdaptedField:
-        return network.field(context if masked is None else context.mask_views(masked), variables.weights())
+        return network.field(context if masked is None else context.mask_views(masked), weights())
 
     pixels = network.live_pixels_of(context, views)
-    return Descent(field, variables.tensors, views, settings, pixels, masks_views=any_views), variables
+    return Descent(field, tensors, weights, views, settings, pixels, masks_views=any_views)
 
 
 def _variables(
     network: HyperPlanesNetwork, context: SupportContext, settings: FineTuning, start: Parameters | None
-) -> Variables:
-    """What a descent optimises: weights, or a copy of the hypernetwork."""
+) -> tuple[list[Tensor], Callable[[], Parameters]]:
+    """The tensors that a descent optimises in place, and a function that makes the weights of the field from them."""
     if settings.trainable == "hypernetwork" and network.hypernetwork is not None:
         observed, theta = observe([context], network.hypernetwork.resolution), network.theta.detach()
-        return Variables.of_hypernetwork(network.hypernetwork, theta, lambda tuned: tuned(observed, theta)[0])
+        tuned = copy.deepcopy(network.hypernetwork).eval().requires_grad_(True)
+        return list(tuned.parameters()), lambda: theta + tuned(observed, theta)[0]
     if start is None:
-        # weights that are partly random are so without learned steps
+        # no learned steps before weights are mixed with random ones
         own = network.adapted_weights(context) if settings.fresh else updated_weights(network, context)
         start = network.finer(_refreshed(network, own, settings), settings.cells or 0)
-    return Variables.of_weights(start)
+    trainable = Parameters((name, value.detach().clone().requires_grad_(True)) for name, value in start.items())
+    return list(trainable.values()), lambda: trainable if torch.is_grad_enabled() else trainable.detach()
 
 
 def _refreshed(network: HyperPlanesNetwork, weights: Parameters, settings: FineTuning) -> Parameters:
-    """Trained weights interpolated with random ones, where a hypernetwork writes a grid; others as they are."""
+    """Trained weights interpolated with random ones if a hypernetwork writes a grid; otherwise unchanged."""
     share = settings.fresh
     if not share or not network.reads_volume:
         return weights

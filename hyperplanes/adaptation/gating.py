@@ -1,4 +1,4 @@
-"""How much of each of two pictures is in a pixel of their mean: a gating network that reads what both show there."""
+"""A gating network: the weights of two pictures in each pixel of their average, computed from both."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from hyperplanes.rendering.compositing import Rendered
 __all__ = ["GatingNetwork", "readings"]
 
 HIDDEN = 16
-READINGS = 9  # numbers that are read of a pixel
-BIAS = -2.0  # of the logit at first: an eighth of the hull
+READINGS = 9  # inputs for a pixel
+BIAS = -2.0  # initial bias of the logit: a share of an eighth
 
 Pixels = TypeVar("Pixels", Rendered, Pictures)
 
@@ -24,8 +24,7 @@ Pixels = TypeVar("Pixels", Rendered, Pictures)
 class GatingNetwork(nn.Module):
     """The share of the visual hull in each pixel of a stacked picture (Jacobs et al. 1991, "Adaptive mixtures").
 
-    Its weights are trained by `training.gating` on objects that the pictures' field was not trained on, and are no
-    part of other trainings.
+    Its weights are trained by `training.gating`, on objects that the field was not trained on, and by nothing else.
     """
 
     def __init__(self) -> None:
@@ -50,8 +49,8 @@ class GatingNetwork(nn.Module):
         Args:
             learned: the pixels of a learned field.
             hull: the same pixels by the visual hull.
-            share: of the hull in all pixels of the object alike, by held-out views.
-            views: how many views are shown.
+            share: of the hull over all pixels, as decided by held-out views.
+            views: number of support views.
         """
         (ours, our_opacity), (theirs, their_opacity) = _by_pixel(learned), _by_pixel(hull)
         read = readings(ours, theirs, our_opacity, their_opacity, share, views)
@@ -74,15 +73,15 @@ def readings(
     share: float,
     views: int,
 ) -> Float[Tensor, "*pixel 9"]:
-    """What is read of pixels: how far both colours differ, both opacities, what held-out views say, and their number.
+    """The inputs for pixels: the difference of both colours, both opacities, the overall share and the number of views.
 
     Args:
         learned: colours of a learned field.
         hull: colours of the visual hull.
         learned_opacity: of the same pixels.
         hull_opacity: of the same pixels.
-        share: of the hull in all pixels of the object alike, by held-out views.
-        views: how many views are shown.
+        share: of the hull over all pixels, as decided by held-out views.
+        views: number of support views.
     """
     differing = 4 * (learned - hull).abs().mean(-1)
     every = torch.ones_like(differing)

@@ -1,4 +1,4 @@
-"""Gradients of a loss that is a sum over parts, each part forward and backward by one thread."""
+"""Gradients of a loss that is a sum of parts, with one thread for the forward and backward pass of each part."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ def summed_gradients(
 ) -> tuple[Tensor, list[Tensor | None]]:
     """The sum of the losses of some parts, and its gradients.
 
-    On the CPU each part runs on one thread, forward and backward. Two threads that share every operation are slower
-    than one where other processes keep the cores busy; with a part each they are not (`python -m benchmarks busy`). The
-    parts are added in their order, so that the result does not depend on the number of threads.
+    On the CPU each part runs forward and backward on one thread. Two threads that share each operation are slower than
+    one if other processes keep the cores busy; with one part each they are not (`python -m benchmarks busy`). The parts
+    are added in order, so the result does not depend on the number of threads.
 
     Args:
-        loss: of one part, by its index. No two parts share a graph that begins before this call, since each is freed
-            after its backward pass.
-        parts: how many there are.
+        loss: of one part, by its index. Parts must not share a graph that was built before this call, since each graph
+            is freed after its backward pass.
+        parts: their number.
         variables: leaves of the graphs.
-        thread_safe: several threads may call `loss` at once.
+        thread_safe: whether several threads may call `loss` at once.
 
     Returns:
-        The sum, without its history, and a gradient for every variable; None where no part depends on it.
+        The sum, detached, and a gradient for each variable; None if no part depends on it.
 
     >>> x = torch.tensor([1.0, 2.0], requires_grad=True)
     >>> summed_gradients(lambda part: x[part] ** 2, 2, [x])
@@ -49,6 +49,6 @@ def summed_gradients(
 
 
 def sum_present(gradients: Sequence[Tensor | None]) -> Tensor | None:
-    """The sum of those that there are; None where there is none."""
+    """The sum of the gradients that are not None; None if all are."""
     found = [each for each in gradients if each is not None]
     return sum(found[1:], found[0]) if found else None

@@ -1,4 +1,4 @@
-"""Views of an object that are held out, by whose pixels what is made of the others is judged."""
+"""Held-out views of an object, on whose pixels a field of the other views is evaluated."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Rays
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.rendering.footprint import pixels_across
-from hyperplanes.rendering.renderer import render
 from hyperplanes.views import Views
 
 __all__ = ["FEWEST", "HeldOutPixels", "Trial", "hold_out"]
 
-FEWEST = 5  # views, of which some can be held out
-HELD_OUT = 2  # of them at least
-ONE_IN = 12  # is held out where that is more: 3 of 47 for 2 bring 0.16 ± 0.14 dB (20 objects), all by two of them
-PIXELS = 2048  # of the views that are held out, at whose edges pictures differ most
-EVEN = 0.2  # contrast up to which one ray through a pixel shows what three do: half the rays
-SIZE = 128  # of all of them, along the longer side, at most: 256 pixels find no better shares, in three times the time
+FEWEST = 5  # views of which some can be held out
+HELD_OUT = 2  # least number of held-out views
+# one view in ONE_IN is held out, if that is more than HELD_OUT: 3 of 47 instead of 2 gain 0.16 ± 0.14 dB (20 objects,
+# all by two of them)
+ONE_IN = 12
+PIXELS = 2048  # of the held-out views
+EVEN = 0.2  # contrast up to which one ray through a pixel serves as well as three: half the rays
+SIZE = 128  # most pixels of all views along the longer side: 256 find no better shares and take three times as long
 
 
 @dataclass(frozen=True)
 class HeldOutPixels:
-    """Some pixels of the views that are held out.
+    """Some pixels of the held-out views.
 
     Attributes:
-        even: rays through the centres of those that differ little from pixels around them.
-        uneven: rays through the others, as many of each pixel as there are SUBPIXELS.
-        truth: the colours of all, even ones first.
+        even: rays through the centres of the pixels with little contrast.
+        uneven: rays through the others, one through each of SUBPIXELS.
+        truth: their true colours, even ones first.
         across: pixels along a diameter of the scene.
     """
 
@@ -47,25 +48,24 @@ class HeldOutPixels:
     across: float
 
     def errors(self, adapted: AdaptedField) -> Float[Tensor, "pixel 3"]:
-        """By how much the colours of a field differ from the true ones.
+        """The differences of the colours of a field from the true ones.
 
         Args:
-            adapted: what is made of the other views.
+            adapted: a field of the other views.
         """
-        sampling = adapted.sampling.for_rendering(self.across)
-        options = {"occupancy": adapted.occupancy, "proposal": adapted.proposal, "differentiable": False}
-        one, three = (render(adapted.field, rays, sampling, **options) for rays in (self.even, self.uneven))
+        finer = adapted.with_sampling(adapted.sampling.for_rendering(self.across))
+        one, three = (finer.trace(rays, differentiable=False) for rays in (self.even, self.uneven))
         return torch.cat([one.colour, three.pooled(len(SUBPIXELS)).colour]) - self.truth
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What a model makes of the views of an object while some are held out.
+    """The field that a model makes of an object while some views are held out.
 
     Attributes:
-        context: of the views that are shown.
-        learned: its field, after half of the learned steps and before any fine-tuning.
-        pixels: of the others, within the hull of those that are shown.
+        context: of the other views.
+        learned: their field, after half of the learned steps and before any fine-tuning.
+        pixels: of the held-out views, inside the hull of the others.
     """
 
     context: SupportContext
@@ -75,16 +75,16 @@ class Trial:
 
 @torch.no_grad()
 def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | None = None) -> Trial | None:
-    """Holds out those views that the others stand closest around, two or one in twelve; all have SIZE pixels at most.
+    """Holds out two views or one in twelve, those closest to the others; all are resized to SIZE pixels at most.
 
     Args:
         network: of a field that takes any number of views.
-        support: the views of an object, where the model is.
-        symmetry: by which the others are reflected.
+        support: the views of an object, on the device of the model.
+        symmetry: by which the other views are reflected.
 
     Returns:
-        None with fewer than FEWEST views, without masks, and where the object is seen by the held-out views alone, or
-        not by them.
+        None with fewer than FEWEST views, without masks, and where only the held-out views see the object, or none of
+        them does.
     """
     if len(support) < FEWEST or support.masks is None:
         return None
@@ -105,6 +105,6 @@ def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | N
     one, colours, _ = held_out.rays_at(pixels[~uneven], near_far=near_far)
     three, others, _ = held_out.rays_at(pixels[uneven], near_far=near_far, subpixels=SUBPIXELS)
     across = pixels_across(held_out.cameras, held_out.bounds)
-    # half of the learned steps, and views judged by the hull: pictures lose 0.01 dB, and it takes half the time
+    # half of the learned steps, and visibility by the hull: pictures lose 0.01 dB, in half the time
     learned = network.field(context, updated_weights(network, context, -(-network.config.learned_steps // 2)))
     return Trial(context, learned, HeldOutPixels(one, three, torch.cat([colours, others]), across))

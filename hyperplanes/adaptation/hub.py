@@ -1,4 +1,4 @@
-"""Checkpoints on the Hugging Face hub, by the optional package huggingface_hub: `pip install 'hyperplanes[hub]'`."""
+"""Checkpoints on the Hugging Face hub, with the optional package huggingface_hub: `pip install 'hyperplanes[hub]'`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INSTALL = "pip install 'hyperplanes[hub]'"
 
 
 def is_repository(name: str) -> bool:
-    """Whether a name is looked for on the hub: user/model, and nothing here is called so."""
+    """Whether a name refers to the hub: it has the form user/model, and there is no such path here."""
     return REPOSITORY.fullmatch(name) is not None and not Path(name).exists()
 
 
@@ -30,7 +30,7 @@ def download_checkpoint(name: str) -> Path:
         name: user/model.
 
     Raises:
-        CheckpointError: no such repository, a hub that cannot be reached, or huggingface_hub is not installed.
+        CheckpointError: the repository is missing, the hub cannot be reached, or huggingface_hub is not installed.
     """
     if not _is_installed():
         raise CheckpointError(
@@ -49,12 +49,12 @@ def download_checkpoint(name: str) -> Path:
 
 
 def upload_checkpoint(save: Callable[[Path], None], name: str, *, private: bool, message: str) -> str:
-    """Write a checkpoint to a repository, made where absent.
+    """Write a checkpoint to a repository, which is created if absent.
 
     Args:
         save: writes the checkpoint to a folder.
         name: user/model.
-        private: for a repository that is made.
+        private: for a repository that is created.
         message: of the commit.
 
     Returns:

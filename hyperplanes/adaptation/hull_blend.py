@@ -1,4 +1,4 @@
-"""Support colours blended on the visual hull: new views without any learning, what a learned method has to beat."""
+"""Support colours blended on the visual hull: a baseline without learning."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from hyperplanes.views import Views
 __all__ = ["HullBlend", "blend_views"]
 
 OPAQUE = 1e4  # density within the hull, per radius of the scene
-STOP = 2e-3  # transmittance; so low that every sample is evaluated: by every second one wings lose 0.05 to 0.5 dB
+STOP = 2e-3  # transmittance; low enough to evaluate every sample: with every second one wings lose 0.05 to 0.5 dB
 SOLID = 0.5  # opacity of a mask from which on a pixel shows the object
-ROUNDING = 1e-4  # of an opacity, by which kernels differ: without it 5 of 424,000 samples in the hull were holes
+ROUNDING = 1e-4  # difference of opacities between kernels: without it 5 of 424,000 samples in the hull were holes
 
 
 @checked_fields
 @dataclass(frozen=True)
 class HullBlend:
-    """The visual hull of the support masks is the surface, and its colour that of the support views that see it.
+    """The visual hull of the support masks as an opaque surface, with blended colours of the support views that see it.
 
-    A point lies in the hull where no view that shows it has background there. Its colour is a mean of the `nearest` of
-    the support views that see it, by the weights of the unstructured lumigraph (`blend_views`). A view
-    sees a point in front of which no part of the hull lies and where its mask is whole, so that no background is mixed
-    into the colour. Where fewer views see the point, the nearest of the others serve.
+    A point lies in the hull unless a view shows background there. Its colour is a mean of the `nearest` of the support
+    views that see it, with the weights of the unstructured lumigraph (`blend_views`). A view sees a point if no part of
+    the hull lies in front of it and the mask is opaque there, so that no background is mixed into the colour. If fewer
+    views see the point, the nearest of the others are added.
 
     Attributes:
-        nearest: number of views that a colour is made of.
-        side: voxels an axis of the hull in which rays march, and by which views are said to see a point.
+        nearest: number of views whose colours are blended.
+        side: voxels an axis of the hull, for ray marching and for the visibility of points.
         steps: samples along a diameter of the scene.
     """
 
@@ -53,7 +53,7 @@ class HullBlend:
     @checked
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The hull and its colours; errors are those of `planes_of`."""
+        """The hull with its colours; raises as `planes_of` does."""
         return self.adapt_to(self.planes_of(support))
 
     def planes_of(self, support: Views, within: Occupancy | None = None) -> VisibilityPlanes:
@@ -61,10 +61,10 @@ class HullBlend:
 
         Args:
             support: the views.
-            within: voxels that their hull is known to lie in; `side` an axis.
+            within: voxels that the hull is known to lie in; `side` an axis.
 
         Raises:
-            ValueError: views without masks, or masks that leave nothing.
+            ValueError: views without masks, or masks whose hull is empty.
         """
         if support.masks is None:
             raise ValueError("hull_blend: expected support views with masks, got none; images with alpha have them")
@@ -73,17 +73,18 @@ class HullBlend:
 
     @torch.no_grad()
     def adapt_to(self, planes: VisibilityPlanes) -> AdaptedField:
-        """As `adapt`, of views whose hull is carved.
+        """As `adapt`, of views with a visual hull.
 
         Args:
-            planes: the views, with masks; the side of their hull counts, not `side`.
+            planes: the views, with masks; the resolution of their hull is used, not `side`.
         """
-        region, blend = planes.occupancy, _Blend(planes, planes.occupancy.bounds, self.nearest)
-        # voxels whose centre lies in the hull: by all that it enters views would see its surface too near
+        region = planes.occupancy
+        # voxels whose centre lies in the hull: with all voxels that it touches, its surface would seem too near
         inside = centres_in_hull(planes, SOLID - ROUNDING)
         depth = inside.occupied * (2 * OPAQUE / len(region.occupied))
         voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
-        blend = replace(blend, planes=planes.with_penalties(Penalties.alike()).with_surface(inside))
+        shown = planes.with_penalties(Penalties.alike()).with_surface(inside)
+        blend = _Blend(shown, region.bounds, self.nearest)
         sampling = _FirstInHull(self.steps, STOP, planes=planes)
         return AdaptedField(blend, region, sampling, densities=(blend.density,), refined=voxels)
 
@@ -91,13 +92,13 @@ class HullBlend:
 def blend_views(
     planes: VisibilityPlanes, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], nearest: int
 ) -> Float[Tensor, "point 3"]:
-    """The mean of the colours of the views nearest to a direction that see the point (`lumigraph_weights`).
+    """The weighted mean of the colours of the nearest views that see a point (`lumigraph_weights`).
 
     Args:
         planes: the views.
         points: in the world.
         directions: unit vectors along which the points are seen.
-        nearest: how many views, at most all.
+        nearest: number of views, at most all.
     """
     if planes.can_describe(points, directions):
         near = planes.describe(points, directions, Reading(0, nearest, 0, 0, 0.0), planes.occupancy.bounds)
@@ -114,7 +115,7 @@ def blend_views(
 
 @dataclass(frozen=True)
 class _FirstInHull(RayMarching):
-    """Of the samples of ray marching, the first of each ray that lies in the hull: all that is seen of an opaque field.
+    """Ray marching that keeps the first sample of each ray in the hull: all that is seen of an opaque field.
 
     Attributes:
         planes: the views whose masks are the hull.
@@ -128,7 +129,7 @@ class _FirstInHull(RayMarching):
         return replace(self, steps=finer.steps, stop=finer.stop)
 
     def place(self, rays: Rays, occupancy: Occupancy | None, generator: torch.Generator | None = None) -> PackedSamples:
-        """As `RayMarching.place`; where no kernel takes the rays, or the samples are random, all samples."""
+        """As `RayMarching.place`; all samples if they are random or no kernel takes the rays."""
         if occupancy is None or generator is not None or not self.planes.has_kernels(rays.origins):
             return super().place(rays, occupancy, generator)
         step = 2 * occupancy.bounds.radius / self.steps
@@ -139,7 +140,7 @@ class _FirstInHull(RayMarching):
 
 @dataclass(frozen=True)
 class _Blend:
-    """The visual hull as an opaque field, in the colours of the support views."""
+    """The visual hull as an opaque field, with colours of the support views."""
 
     planes: VisibilityPlanes
     bounds: Sphere
@@ -149,7 +150,7 @@ class _Blend:
 
     @property
     def dtype(self) -> torch.dtype:
-        """That of the views, in which points are expected."""
+        """The dtype of the views, in which points are expected."""
         return self.planes.maps.dtype
 
     def __call__(
@@ -159,12 +160,12 @@ class _Blend:
         return blend_views(self.planes, points, directions, self.nearest), self.density(points)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """High where every view that shows a point shows the object there, else 0."""
+        """High where every view that shows a point shows the object there, otherwise 0."""
         coverage = self.planes.choose(points, best=0).coverage
         return torch.where(coverage < SOLID - ROUNDING, 0.0, OPAQUE / self.bounds.radius)
 
     def hidden(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """The points: densities and colours have nothing in common."""
+        """The points themselves: densities and colours share no computation."""
         return points
 
     def density_of(self, hidden: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:

@@ -1,4 +1,4 @@
-"""HyperPlanes: a target network, and the hypernetwork that writes its update from a few support views."""
+"""HyperPlanes: a target network, and the hypernetwork that predicts its update from a few support views."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ __all__ = ["HyperPlanes", "ModelConfig"]
 class HyperPlanes(HyperPlanesNetwork):
     """theta, the hypernetwork that updates it, and the rig of support views it was trained with.
 
-    Without a hypernetwork the same weights serve every object: the plain target network that the paper compares with.
-    Views are taken to where the weights are.
+    Without a hypernetwork all objects share the same weights: the plain target network that the paper compares with.
+    Views are moved to the device of the weights.
 
     Args:
-        config: what it is made of.
-        seed: of the weights; the global random state is left alone.
+        config: the architecture.
+        seed: of the weights; the global random state is not used.
 
     Raises:
-        ValueError: parts that do not go together (`configuration.compatibility`).
+        ValueError: incompatible parts (`configuration.compatibility`).
     """
 
     def without_reflections(self) -> Self:
-        """This model, from now on shown no reflections of the views of an object, however symmetric that looks."""
+        """This model, which from now on uses no reflections of the views of an object, even if it looks symmetric."""
         self.config = replace(self.config, symmetric=False, symmetry=None)
         return self
 
     def without_residuals(self) -> Self:
-        """This model, whose pictures are from now on not corrected by residuals (`adaptation.residuals`)."""
+        """This model, from now on without residual correction of its pictures (`adaptation.residuals`)."""
         self.config = replace(self.config, residuals=False)
         return self
 
@@ -62,34 +62,33 @@ class HyperPlanes(HyperPlanesNetwork):
     def adapt(self, support: Views) -> AdaptedField:
         """The field of one object in one forward pass: theta + delta (HyperPlanes, Eq. 6).
 
-        A network then takes `config.learned_steps` steps of gradient descent (`adaptation.learned_steps`). Where
-        `config.symmetric` says so, reflections of the views of an object that looks symmetric count as views, too
-        (`adaptation.symmetry`), and it is adapted to in its canonical frame (`adaptation.canonical_frame`). Where
-        `config.stacked` says so, its pictures are means with those of the visual hull (`adaptation.stacking`). Where
-        `config.residuals` says so, pictures are corrected by what the field lacks in its views
-        (`adaptation.residuals`).
+        Then come `config.learned_steps` steps of gradient descent by a network (`adaptation.learned_steps`). With
+        `config.symmetric`, reflections of the views of an object that looks symmetric are added to its views
+        (`adaptation.symmetry`), and it is adapted to in its canonical frame (`adaptation.canonical_frame`). With
+        `config.stacked`, pictures are averaged with those of the visual hull (`adaptation.stacking`). With
+        `config.residuals`, pictures are corrected by the residuals of the support views (`adaptation.residuals`).
         """
         return corrected_field(self, one_step(self, support), support)
 
     @checked
     @without_autocast
     def find_symmetry(self, support: Views) -> Symmetry | None:
-        """The symmetry by which the views of an object are to be reflected, where `config.symmetric` says so.
+        """The symmetry by which the views of an object are reflected, if `config.symmetric` is set.
 
         Args:
             support: the views of one object.
 
         Returns:
-            `config.symmetry` where that is known. Else the planes about which the object looks symmetric
+            `config.symmetry` if that is known. Otherwise the planes about which the object looks symmetric
             (`symmetry.symmetry_of`), or None. A single view is reflected about several planes if its silhouette and
-            colours show them, and about one if it is shown better so itself.
+            colours show them, and about one if the model renders the view itself better with it.
         """
         return find_symmetry(self, support)
 
     @torch.inference_mode(mode=False)
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:
-        """As `adapt`, of an object that is prepared, with reflections of its views or without."""
+        """As `adapt`, of a prepared object, with or without reflections of its views."""
         return corrected_field(self, stacked_field(self, context, updated_weights(self, context)), context.given)
 
     @checked
@@ -105,30 +104,30 @@ class HyperPlanes(HyperPlanesNetwork):
     ) -> AdaptedField:
         """The field of one object after gradient steps on its support views; the model itself stays as it is.
 
-        It begins at theta + delta, of which `settings.fresh` is replaced by random weights. Either these weights
-        themselves are optimised, or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes,
-        section 3, fine-tuning). No step is the field of `adapt`. From 20 views on the weights' grid of features
-        gets more cells (`settings.cells`). From ten views on pictures are corrected as those of `adapt`. Where the
-        model does not correct them (`without_residuals`, or large views), but has a gating network, they are means with
-        those of the visual hull (`stacking.tuned_field`). From fewer views they are means with those of the field
-        before the steps (`settings.average`).
+        The steps begin at theta + delta, interpolated with random weights by `settings.fresh`. They optimise either
+        these weights or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes, section 3,
+        fine-tuning). Zero steps give the field of `adapt`. From 20 views on, the grid of features gets more cells
+        (`settings.cells`). From ten views on, pictures are corrected as those of `adapt` are. If the model does not
+        correct them (`without_residuals`, or large views) but has a gating network, they are averaged with those of the
+        visual hull (`stacking.tuned_field`). With fewer views they are averaged with those of the field before the
+        steps (`settings.average`).
 
         Args:
             support: the views of the object.
-            steps: gradient steps on rays of the support views, or "auto": as many, up to `settings.max_steps`, as show
-                support views best that were held out for the purpose; 0 where every step made those worse.
+            steps: gradient steps on rays of the support views, or "auto": the number, up to `settings.max_steps`, that
+                is best for held-out support views; 0 if all steps make these worse.
             settings: what is optimised, rates, rays and seed.
             on_step: called with the number of steps done, before the first and after each.
-            on_trial: likewise, while "auto" finds how many they are to be; there are up to `settings.max_steps`.
+            on_trial: the same for the trial steps of "auto", of which there are up to `settings.max_steps`.
 
         Returns:
-            The field. Steps that cannot be taken are a ValueError: those of a hypernetwork that the model has not, a
-            negative number, "auto" with fewer than 3 views, or a single view of a field that takes any number of them,
-            unless `settings.mask_views` is off. So are steps that lower nothing (`NoProgressError`, which holds the
-            field that they ended at).
+            The field. Raises ValueError for steps that are impossible: on a hypernetwork that the model does not have,
+            a negative number, "auto" with fewer than 3 views, or on a single view of a field that takes any number of
+            them, unless `settings.mask_views` is off. Raises NoProgressError, a ValueError with the final field, if the
+            steps do not lower the error.
 
         Raises:
-            RuntimeError: within `torch.inference_mode`.
+            RuntimeError: inside `torch.inference_mode`.
         """
         if torch.is_inference_mode_enabled():
             raise RuntimeError("fine_tune: expected gradients, got torch.inference_mode; call it outside of that")
@@ -139,13 +138,13 @@ class HyperPlanes(HyperPlanesNetwork):
         """The weights of one object as a model without a hypernetwork: its theta is theta + delta (HyperPlanes, Eq. 6).
 
         Args:
-            adapted: what this model made of the object.
+            adapted: the field that this model made of the object.
 
         Returns:
-            A model that makes the same field of the same views, without looking at them twice.
+            A model that makes the same field from the same views, with symmetry, frame and hull share fixed.
 
         Raises:
-            ValueError: a field that is no network of this model.
+            ValueError: a field of another model.
         """
         adapted = adapted.without_residuals()
         learned = learned_part(adapted)
@@ -174,9 +173,9 @@ class HyperPlanes(HyperPlanesNetwork):
         """Write model.json and model.safetensors.
 
         Args:
-            folder: made where absent.
-            dtype: of the weights in the file, such as float16, which halves it; their own where absent. Statistics stay
-                as they are, and `from_pretrained` makes single precision of all.
+            folder: created if absent.
+            dtype: of the weights in the file, such as float16, which halves it; by default their own. Buffers keep
+                their dtype, and `from_pretrained` converts all to float32.
         """
         check_precision(dtype)
         weights = self.state_dict()
@@ -190,12 +189,13 @@ class HyperPlanes(HyperPlanesNetwork):
         """Write the model to a repository of the Hugging Face hub, from which `from_pretrained` reads it.
 
         Args:
-            repository: user/model; made where absent.
-            private: for a repository that is made.
+            repository: user/model; created if absent.
+            private: for a repository that is created.
             message: of the commit.
 
         Returns:
-            The address of the commit. A name of another form raises ValueError, a missing huggingface_hub RuntimeError.
+            The address of the commit. Raises ValueError for a name of another form, and RuntimeError if huggingface_hub
+            is not installed.
         """
         return upload_checkpoint(self.save, repository, private=private, message=message)
 
@@ -206,9 +206,9 @@ class HyperPlanes(HyperPlanesNetwork):
 
         Args:
             name: its folder, the name of a model that comes with the package, or user/model on the Hugging Face hub
-                where huggingface_hub is installed; a folder of that name goes first.
+                if huggingface_hub is installed; a folder of that name takes precedence.
 
         Returns:
-            The model, ready for use. What is missing, damaged or does not fit is a DataError.
+            The model, in evaluation mode. Raises DataError if it is missing, damaged or does not fit.
         """
         return read_checkpoint(name, cls)

@@ -1,4 +1,4 @@
-"""How well views are shown by their visual hull with reflections, and the plane by which they are shown best."""
+"""How well views are explained by the visual hull of them and their reflections, and the best plane of reflection."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ from hyperplanes.views import Views
 
 __all__ = ["TOLERANCE", "SymmetryJudge", "best_vertical_plane", "carved"]
 
-SIZE, COARSE_SIZE = 64, 32  # pixels of views along the longer side, at most: to judge a plane, and to look for one
-COARSE_HULL = 48  # voxels an axis, to look for one
+SIZE, COARSE_SIZE = 64, 32  # most pixels of views along the longer side: to judge a plane, and to search for one
+COARSE_HULL = 48  # voxels an axis, to search for one
 STEPS = 2  # of rays in a voxel
-AZIMUTHS = 24  # of vertical planes that are tried
-NEARLY = 1.5  # times the error of the best of these, up to which better ones are looked for near to the second, too
-COARSE_ROUNDS, FINE_ROUNDS = 3, 2  # of looking for better ones
-SPAN = 0.04  # radii of the scene, by which planes are moved first
-LOST = 0.05  # share of the object's pixels that the hull with reflections may miss
-TOLERANCE = 1.75  # times the squared error without reflections, by which the views still show the same object
-FLOOR = 3e-3  # of that error in a pixel of the object; smaller ones are those of the hull's voxels
+AZIMUTHS = 24  # number of vertical planes that are tried
+NEARLY = 1.5  # times the least error, up to which the second best of these is refined too
+COARSE_ROUNDS, FINE_ROUNDS = 3, 2  # of refinement
+SPAN = 0.04  # first change of a plane's offset, in radii of the scene
+LOST = 0.05  # fraction of the object's pixels that the hull with reflections may miss
+TOLERANCE = 1.75  # times the squared error without reflections, up to which an object counts as symmetric
+FLOOR = 3e-3  # added to the squared error per pixel of the object; smaller errors come from the voxels of the hull
 
 ORDERS = {2: (), 3: (), 4: (2,), 6: (2, 3), 8: (2, 4)}
-"""Orders that are tried, and those that an object of such a symmetry has, too."""
-MOST_IMAGES = 64  # views and reflections; more make no better pictures, and take longer
-MOST_PIXELS = 1 << 25  # of them about several planes: with 192 million adapting takes 10 GB and ten times as long
-WORTH = 0.5  # power of the order by which the error may grow
+"""Orders that are tried, each with the lower ones that it implies."""
+MOST_IMAGES = 64  # views and reflections; more do not improve pictures and take longer
+MOST_PIXELS = 1 << 25  # of these for several planes: with 192 million adapting takes 10 GB and ten times as long
+WORTH = 0.5  # the error may grow with this power of the order
 
 
 @dataclass(frozen=True)
 class _PixelRays:
-    """Rays through pixels of views as pictures are rendered, which are cast once: five where the views have an edge.
+    """Rays through pixels of views, cast once, as for pictures: five through pixels at edges.
 
     Attributes:
         rays: of all pixels.
-        pixels: that each goes through, as flat indices (view, row, column).
-        shares: of each in its pixel.
+        pixels: flat index (view, row, column) of the pixel of each ray.
+        shares: weight of each ray in its pixel.
     """
 
     rays: Rays
@@ -60,7 +60,7 @@ class _PixelRays:
     def of(cls, views: Views, pixels: Int[Tensor, " pixel"]) -> _PixelRays:
         """The rays of pixels of views with masks."""
         assert views.masks is not None
-        # an edge of a picture that was scaled down is two pixels wide, each of which differs half as much
+        # after scaling down, an edge is two pixels wide, and each differs half as much
         values = torch.cat([views.images, views.masks], 1).permute(0, 2, 3, 1)
         edges = pixels[pixels_at_edges(values, EDGE / 2).flatten()[pixels]]
         centres, _, _ = views.rays_at(pixels)
@@ -69,7 +69,7 @@ class _PixelRays:
         return cls(join_rays(centres, others), through, 1 / through.bincount()[through])
 
     def picture(self, colours: Float[Tensor, "ray 3"], shape: torch.Size) -> Float[Tensor, "view 3 height width"]:
-        """The means of the colours of rays in masks of a shape (view, 1, height, width); white elsewhere."""
+        """Images of the mean colour of the rays in each pixel, white elsewhere; `shape` is (view, 1, height, width)."""
         found = colours.new_ones(shape.numel(), 3).index_fill_(0, self.pixels, 0.0)
         found.index_add_(0, self.pixels, colours * self.shares[:, None])
         return found.unflatten(0, (shape[0], *shape[2:])).permute(0, 3, 1, 2)
@@ -77,14 +77,14 @@ class _PixelRays:
 
 @dataclass(frozen=True)
 class SymmetryJudge:
-    """How well views are shown by `HullBlend` of them and their reflections.
+    """How well `HullBlend` of views and their reflections renders the views.
 
     Attributes:
-        views: small ones.
+        views: scaled down.
         voxels: their visual hull.
-        rays: through the pixels of the views that may show it.
-        alone: squared error without reflections, and FLOOR.
-        floor: of all errors.
+        rays: through the pixels of the views that may show the hull.
+        alone: squared error without reflections, plus `floor`.
+        floor: added to all squared errors.
     """
 
     views: Views
@@ -95,7 +95,7 @@ class SymmetryJudge:
 
     @classmethod
     def of(cls, support: Views, size: int = SIZE, side: int = HULL_SIDE) -> SymmetryJudge:
-        """The judge of views with masks, so many pixels along the longer side at most."""
+        """The judge of views with masks, resized to at most `size` pixels along the longer side."""
         views = support.resized(size)
         assert views.masks is not None
         voxels, floor = carved(views, side), FLOOR * float((views.masks >= SHOWN).sum())
@@ -103,7 +103,7 @@ class SymmetryJudge:
         return replace(judge, alone=judge.squared_error(None) + floor)
 
     def errors(self, planes: Sequence[Plane], most: float = math.inf) -> dict[Plane, float]:
-        """Those of the planes by which they are at most so large, and finite."""
+        """The errors of the planes for which they are finite and at most `most`."""
         errors = side_by_side(lambda plane: self.error(Symmetry(plane)), planes, self.views.images.device)
         found = zip(planes, errors, strict=True)
         return {plane: error for plane, error in found if error <= most and math.isfinite(error)}
@@ -111,17 +111,17 @@ class SymmetryJudge:
     def several(
         self, plane: Plane, error: float, given: Views, least: int = 2, most: float = TOLERANCE
     ) -> tuple[Symmetry, float] | None:
-        """The most likely order of symmetries of several planes, one of which is known, and its error over its worth.
+        """The most likely symmetry of several planes, one of which is known, and its error divided by order**WORTH.
 
         Args:
-            plane: the one.
-            error: by it alone.
-            given: all views of the object, of which there are to be reflections.
-            least: order.
-            most: error of such an order.
+            plane: the known one.
+            error: of that plane alone.
+            given: all views of the object, which are to be reflected.
+            least: least order.
+            most: largest error.
 
         Returns:
-            None where it is more likely that there are no other ones.
+            None if it is more likely that there is no other plane.
         """
         if abs(plane.normal[1]) > 1e-6:
             return None
@@ -143,17 +143,17 @@ class SymmetryJudge:
         return None if found is None else (found, best)
 
     def error(self, symmetry: Symmetry) -> float:
-        """That of the hull of views and reflections; infinite where it loses too many pixels."""
+        """The squared error relative to that without reflections; infinite if the hull loses too many pixels."""
         return (self.squared_error(symmetry) + self.floor) / self.alone
 
     def squared_error(self, symmetry: Symmetry | None) -> float:
-        """That of the views by `HullBlend` of them and their reflections.
+        """The squared error with which `HullBlend` of the views and their reflections renders the views.
 
         Args:
             symmetry: of the reflections, if there are any.
 
         Returns:
-            The sum over pixels; infinite where the hull with reflections loses too many of them.
+            The sum over pixels; infinite if the hull with reflections loses too many of them.
         """
         views, shown, voxels = self.views, self.views, self.voxels
         assert views.masks is not None
@@ -173,14 +173,14 @@ class SymmetryJudge:
 
 
 def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
-    """The vertical plane by which views are shown best.
+    """The vertical plane of reflection with the least error.
 
-    Planes of all azimuths are tried by smaller pictures, then those near to the best one or two, and last, by larger
-    pictures, those beside the best of these. A few degrees beside the right plane the error is several times as large.
+    Planes of all azimuths are tried on smaller pictures, then planes near the best one or two, and finally, on larger
+    pictures, planes near the best of these. A few degrees off the right plane the error is several times as large.
 
     Args:
-        judge: by the larger pictures.
-        views: what is judged.
+        judge: for the larger pictures.
+        views: of the object.
     """
     coarse, step = SymmetryJudge.of(views, COARSE_SIZE, COARSE_HULL), math.pi / AZIMUTHS
     angles = {_vertical(views.bounds, index * step): index * step for index in range(AZIMUTHS)}
@@ -197,7 +197,7 @@ def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
 
 
 def carved(views: Views, side: int = HULL_SIDE, within: Occupancy | None = None) -> Occupancy:
-    """The visual hull of views with masks, which may be empty; the part of it within some voxels, if there are any."""
+    """The visual hull of views with masks, which may be empty; only the part inside `within`, if given."""
     assert views.masks is not None
     return carve(views.masks, views.cameras, views.bounds, side, within=within)
 
@@ -205,13 +205,13 @@ def carved(views: Views, side: int = HULL_SIDE, within: Occupancy | None = None)
 def _refined(
     judge: SymmetryJudge, start: tuple[float, float], steps: tuple[float, float], rounds: int
 ) -> tuple[tuple[float, float], float]:
-    """Azimuth and offset of a vertical plane near to another one by which views are shown better, and its error.
+    """Azimuth and offset of the best vertical plane found near another one, and its error.
 
     Args:
         judge: of the views.
         start: azimuth and offset of the other one.
-        steps: by which both are changed first; half as much in each further round.
-        rounds: how many.
+        steps: first changes of both, halved in each further round.
+        rounds: number of rounds.
     """
     (angle, offset), (turn, shift), bounds = start, steps, judge.views.bounds
     error = judge.error(Symmetry(_vertical(bounds, angle, offset)))
@@ -228,5 +228,5 @@ def _refined(
 
 
 def _vertical(bounds: Sphere, angle: float, offset: float = 0.0) -> Plane:
-    """The vertical plane whose normal has this azimuth, so many radii from the middle of a scene."""
+    """The vertical plane whose normal has this azimuth, at an offset from the centre of the scene in radii."""
     return Plane.of_sphere(bounds, (math.cos(angle), 0.0, math.sin(angle)), offset)

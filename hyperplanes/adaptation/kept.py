@@ -1,7 +1,7 @@
-"""What was made of views kept on disk by what it was made of, so that two commands on the same views make it once.
+"""A disk cache of what is computed from views, keyed by a hash of its inputs, so that two commands share results.
 
-Adapted fields lie in `$HYPERPLANES_CACHE/adapted`, by default `~/.cache/hyperplanes/adapted`, refined poses and learned
-backgrounds beside them. All of it may be deleted at any time.
+Adapted fields are in `$HYPERPLANES_CACHE/adapted`, by default `~/.cache/hyperplanes/adapted`, with refined poses and
+learned backgrounds beside them. All of it may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from hyperplanes.views import Views
 
 __all__ = ["keep_field", "keep_tensors", "kept_file", "kept_folder", "recall_field", "recall_tensors"]
 
-MOST = 10  # of a kind that are kept; the oldest goes first
+MOST = 10  # entries of a kind; the oldest is deleted first
 
 
 def kept_folder(model: HyperPlanes, views: Views, steps: Steps, settings: FineTuning) -> Path:
-    """Where the field of these weights, views and options is kept, whether it is there or not.
+    """The folder for the field of these weights, views and options, which may not exist.
 
     Args:
-        model: what adapts.
+        model: the model that adapts.
         views: the support views.
         steps: of fine-tuning.
         settings: of fine-tuning.
@@ -44,20 +44,20 @@ def kept_folder(model: HyperPlanes, views: Views, steps: Steps, settings: FineTu
 
 
 def kept_file(kind: str, views: Views, model: HyperPlanes | None = None, *options: object) -> Path:
-    """Where the tensors that were made of views are kept, whether they are there or not.
+    """The file for tensors computed from views, which may not exist.
 
     Args:
         kind: of tensors, the name of a folder.
-        views: what they were made of.
-        model: what had a say in it, if any.
-        options: what else had, as JSON can hold it.
+        views: the input.
+        model: that they also depend on, if any.
+        options: other inputs that JSON can represent.
     """
     options = (*options, None if model is None else model.config.as_json())
     return _home() / kind / f"{_digest(options, views, [] if model is None else _weights(model))}.safetensors"
 
 
 def keep_tensors(file: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Keep some tensors; of more than ten such files the oldest are deleted.
+    """Save tensors; of more than ten such files the oldest are deleted.
 
     Args:
         file: of `kept_file`.
@@ -68,11 +68,11 @@ def keep_tensors(file: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def recall_tensors(file: Path, names: Sequence[str]) -> dict[str, Tensor] | None:
-    """The tensors that were kept, or None where none were, or others, or some that cannot be read.
+    """The saved tensors, or None if the file is missing, cannot be read, or holds other tensors.
 
     Args:
         file: of `kept_file`.
-        names: of those that there should be.
+        names: of the expected tensors.
     """
     try:
         found = load_tensors(file) if file.exists() else {}
@@ -90,7 +90,7 @@ def _weights(model: HyperPlanes) -> Iterator[Tensor]:
 
 
 def _digest(options: Iterable[object], views: Views, weights: Iterable[Tensor]) -> str:
-    """A hash of all that something was made of, the code that made it included."""
+    """A hash of all inputs and of the code."""
     digest = hashlib.sha256(_code().encode())
     digest.update(json.dumps([*options, repr(views.bounds)]).encode())
     for part in (*weights, *_parts(views)):
@@ -114,7 +114,7 @@ def _delete_oldest(folder: Path) -> None:
 
 @cache
 def _code() -> str:
-    """A hash of the package's own files: what another version adapted is not taken for what this one would."""
+    """A hash of the files of the package, so that results of other versions are not used."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.parent.glob("**/*.py")):
         digest.update(path.read_bytes())
@@ -122,11 +122,11 @@ def _code() -> str:
 
 
 def keep_field(model: HyperPlanes, field: AdaptedField, folder: Path) -> None:
-    """Keep a field; of more than ten the oldest are deleted.
+    """Save a field; of more than ten the oldest are deleted.
 
     Args:
-        model: what made it.
-        field: of `model`.
+        model: the model that made it.
+        field: the field.
         folder: of `kept_folder`.
     """
     model.with_weights_of(field).save(folder)
@@ -134,12 +134,12 @@ def keep_field(model: HyperPlanes, field: AdaptedField, folder: Path) -> None:
 
 
 def recall_field(folder: Path, views: Views, device: torch.device | str = "cpu") -> AdaptedField | None:
-    """The field that was kept, or None where none was, or one that cannot be read.
+    """The saved field, or None if there is none or it cannot be read.
 
     Args:
         folder: of `kept_folder`.
-        views: the same as there.
-        device: where the field goes.
+        views: as in `kept_folder`.
+        device: of the field.
     """
     if not (folder / "model.json").exists():
         return None

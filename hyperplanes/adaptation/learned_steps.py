@@ -1,4 +1,4 @@
-"""Learned steps of gradient descent, after the forward pass of the hypernetwork."""
+"""Learned steps of gradient descent after the forward pass of the hypernetwork."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from hyperplanes.parameters import Parameters
 
 __all__ = ["grid_gradient", "step_inputs", "take_learned_steps", "updated_weights"]
 
-RAYS, PARTS = 2048, 4  # of a step, and into how many parts these are divided, each with other views masked
-ONE_IN = 6  # views that are masked in a part
+RAYS, PARTS = 2048, 4  # rays of a step, and parts that they are divided into, each with other views masked
+ONE_IN = 6  # a part masks one view in ONE_IN
 
 
 def updated_weights(network: HyperPlanesNetwork, context: SupportContext, steps: int | None = None) -> Parameters:
-    """The weights of an object as they are in use: theta + delta, changed by the learned steps.
+    """The weights of an object for use: theta + delta after the learned steps.
 
     Args:
         network: the model.
@@ -35,16 +35,16 @@ def take_learned_steps(
 ) -> Parameters:
     """The weights after the learned steps.
 
-    With FINE_VIEWS given views or more they are half as many: more bring nothing there (docs/image-based.md).
+    With FINE_VIEWS given views or more, half as many are taken: more gain nothing there (docs/image-based.md).
 
     Args:
         network: the model.
         context: the object.
-        weights: to begin with.
-        steps: of few views; those of `ModelConfig.learned_steps` where absent.
+        weights: the initial ones.
+        steps: number for few views; by default `ModelConfig.learned_steps`.
 
     Returns:
-        The same weights where the model has no learned steps, and for an object without masks or of a single view.
+        The same weights if the model has no learned steps, and for an object without masks or with a single view.
     """
     step = network.learned_step
     if step is None or context.volume is None or context.views.masks is None or len(context.given) < 2:
@@ -67,15 +67,15 @@ def step_inputs(
     *,
     pixels: Int[Tensor, " pixel"] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What a `LearnedStep` reads of an object: hull, grid and gradient, as of one of several objects.
+    """The inputs of a `LearnedStep` for one object, with a batch dimension: hull, grid and gradient.
 
     Args:
         network: the model, whose hypernetwork reads a volume.
         context: the object.
         weights: of its field.
-        rays: as in `grid_gradient`, and so the others.
-        generator: of views, rays and samples.
-        pixels: that rays are drawn from.
+        rays: as in `grid_gradient`.
+        generator: as in `grid_gradient`.
+        pixels: as in `grid_gradient`.
     """
     assert context.volume is not None
     gradient = grid_gradient(network, context, weights, rays, generator, pixels=pixels)
@@ -91,20 +91,20 @@ def grid_gradient(
     *,
     pixels: Int[Tensor, " pixel"] | None = None,
 ) -> Float[Tensor, "feature x y z"]:
-    """The gradient of the mean squared error of random rays of the views of an object, in the grid of features.
+    """The gradient of the mean squared error of random rays of the views of an object in the grid of features.
 
-    The field is not shown the views that rays come from, as in fine-tuning.
+    The views that rays come from are masked, as in fine-tuning.
 
     Args:
         network: the model.
         context: the object.
         weights: of its field.
-        rays: how many.
+        rays: number of rays.
         generator: of views, rays and samples, on the CPU.
-        pixels: flat indices of those that rays are drawn from; found where absent.
+        pixels: flat indices of the pixels that rays are drawn from; by default those that may show the object.
 
     Returns:
-        The gradient; zeros where no ray meets the object.
+        The gradient; zeros if no ray meets the object.
     """
     views = trained_on(context, context.given)
     if pixels is None:
@@ -131,7 +131,7 @@ def grid_gradient(
 
 
 def _masked(count: int, generator: torch.Generator) -> list[Int[Tensor, " masked"]]:
-    """The views that each part masks: random ones, and none twice before all were."""
+    """The views that each part masks, drawn at random, none a second time before all were drawn."""
     size = max(1, count // ONE_IN)
     order = torch.cat([torch.randperm(count, generator=generator) for _ in range(-(-PARTS * size // count))])
     return list(order[: PARTS * size].split(size))

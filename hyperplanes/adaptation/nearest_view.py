@@ -1,4 +1,4 @@
-"""The support view seen from nearest, copied: what every method has to beat."""
+"""A copy of the support view with the nearest viewing direction: a baseline."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torch.nn.functional import grid_sample, interpolate
 from hyperplanes.adaptation.base import Pictures
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.rays import pixel_grid
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.views import Views
 
@@ -24,10 +25,10 @@ class _Copies:
     support: Views
 
     def render(self, cameras: PinholeCamera) -> Pictures:
-        """The support image whose camera stands in the most similar direction from the scene's centre.
+        """The support images whose cameras lie in the most similar directions from the scene's centre.
 
-        Its mask is the opacity; without masks all that is in a picture counts as there. Through another lens, what the
-        copied picture does not show is white, with opacity 0. Depth is not known: 0.
+        Their masks are the opacity, which is 1 without masks. For cameras with other intrinsics, pixels outside the
+        copied image are white, with opacity 0. Depth is not known and is 0.
         """
         known, asked = (
             camera.camera_directions(each, self.support.bounds.centre).to(self.support.images)
@@ -48,17 +49,16 @@ class _Copies:
 def _through(
     copied: Float[Tensor, "1 4 height width"], lens: PinholeCamera, asked: PinholeCamera
 ) -> Float[Tensor, "1 4 asked_height asked_width"]:
-    """Colours and opacity as another camera would show them from the same place, by bilinear interpolation."""
+    """Colours and opacity seen by another camera from the same pose, by bilinear interpolation."""
     (height, width), size = camera.image_size(asked), camera.image_size(lens)
     if (height, width) == size and torch.equal(_calibration(asked).to(copied), _calibration(lens).to(copied)):
         return copied
-    # where the picture has what each pixel looks at
+    # the place in the image that each pixel looks at
     still = torch.eye(4).to(asked.extrinsics)[None]
-    y, x = torch.meshgrid(*(torch.arange(each).to(asked.extrinsics) for each in (height, width)), indexing="ij")
-    pixels = torch.stack([x, y], -1).reshape(1, -1, 2)
+    pixels = pixel_grid(height, width).to(asked.extrinsics)[None]
     points = camera.with_poses(asked, still).unproject(pixels, torch.ones_like(pixels[..., :1]))
     found = camera.with_poses(lens, still.to(lens.extrinsics)).project(points.to(lens.extrinsics)).to(copied)
-    # a picture of more pixels is reduced first, averaging
+    # an image of higher resolution is scaled down first, with antialiasing
     scale = float((camera.intrinsics(asked).to(copied) / camera.intrinsics(lens).to(copied))[0, [0, 1], [0, 1]].mean())
     if scale < 1:
         copied = interpolate(copied, [max(1, round(scale * side)) for side in size], mode="bilinear", antialias=True)
@@ -75,11 +75,11 @@ def _calibration(cameras: PinholeCamera) -> Tensor:
 
 
 class NearestView:
-    """No learning at all."""
+    """A method that copies support views."""
 
     @checked
     def adapt(self, support: Views) -> _Copies:
-        """Remember the support views; none is a ValueError."""
+        """Keeps the support views; ValueError if there are none."""
         if not len(support):
             raise ValueError("support: expected at least one view, got none")
         return _Copies(support)

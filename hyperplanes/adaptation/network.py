@@ -1,4 +1,4 @@
-"""The network behind HyperPlanes: theta, the hypernetwork that updates it, and the rig of views it was trained with."""
+"""The network of HyperPlanes: theta, the hypernetwork that updates it, and the rig of views it was trained with."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ GRID = "fine.grid.weight"
 
 
 class HyperPlanesNetwork(nn.Module):
-    """Support views -> what is prepared of them -> an update of theta; weights -> a field.
+    """Support views -> a support context -> an update of theta; weights -> a field.
 
     Args:
-        config: what it is made of.
-        seed: of the weights; the global random state is left alone.
+        config: the architecture.
+        seed: of the weights; the global random state is not used.
 
     Raises:
-        ValueError: parts that do not go together (`configuration.compatibility`).
+        ValueError: incompatible parts (`configuration.compatibility`).
     """
 
     rig: Tensor
@@ -70,32 +70,32 @@ class HyperPlanesNetwork(nn.Module):
 
     @property
     def theta(self) -> Parameters:
-        """The universal weights, shared with the module."""
+        """The universal weights; the tensors are those of the module."""
         return Parameters.of(self.networks)
 
     @property
     def theta_before(self) -> Parameters | None:
-        """The weights before the gradient steps that made theta, where `config.average` says so."""
+        """The weights before the gradient steps that made theta, if `config.average` is not 0."""
         return Parameters.of(self.networks_before) if self.networks_before else None
 
     @property
     def target(self) -> Target:
-        """The network that colours and densities come from."""
+        """The network of colours and densities; with a coarse network, the fine one."""
         return self.targets["fine"]
 
     @property
     def reads_volume(self) -> bool:
-        """Whether its hypernetwork reads what all views show on a grid."""
+        """Whether it has a hypernetwork that reads a volume."""
         return self.hypernetwork is not None and self.hypernetwork.reads_volume
 
     @property
     def known_rig(self) -> Rig:
-        """Where the views of the training stood, and how others are matched to them; empty where nothing asks."""
+        """The rig of the training views; empty where neither the field nor a hypernetwork needs it."""
         asked = self.target.reads_planes or self.hypernetwork is not None
         return Rig(self.rig if asked else self.rig[:0], self.config.order)
 
     def set_rig(self, support: Views) -> None:
-        """Take the camera directions of these support views as the order of the planes; some fields have none.
+        """Store the camera directions of these support views as those of the planes, if the field has a rig.
 
         Raises:
             ValueError: fewer views than planes.
@@ -108,24 +108,24 @@ class HyperPlanesNetwork(nn.Module):
     def arrange(self, support: Views) -> Views:
         """The support views as the field takes them: one a plane of the rig, or all as they are.
 
-        More views than planes: the best matching ones, none twice. Fewer: some stand for several planes. With order
-        "file" the views stay in their order: the first ones, and again from the first where there are too few.
-        No view, or a rig that was never set, is a ValueError.
+        Of more views than planes, the best matches are taken, each once. Of fewer, some views become several planes.
+        With order "file" the views keep their order: the first ones, repeated from the first if they are too few.
+        Raises ValueError without views, or if the rig was never set.
         """
         return arrange(support, self.target, self.known_rig)
 
     @checked
     def prepare(self, support: Views, *, carved: bool = True, symmetry: Symmetry | None = None) -> SupportContext:
-        """All that depends on the support views and not on weights.
+        """Computes what depends on the support views but not on weights.
 
         Args:
             support: the views of one object, on any device and in any precision.
-            symmetry: of the object: reflections of the views count as views, too.
-            carved: without, one voxel that may hold anything stands for the hull, for who never asks it. A hypernetwork
-                that reads the hull has it carved in any case.
+            symmetry: of the object, whose views are then followed by their reflections.
+            carved: if False, a single occupied voxel replaces the hull, for callers that never query it. For a
+                hypernetwork that reads the hull it is carved in any case.
 
         Raises:
-            ValueError: a symmetry where the field knows its views by their places.
+            ValueError: a symmetry for a field that does not take any number of views.
         """
         if symmetry is not None and not self.target.permutation_invariant:
             raise ValueError(f"symmetry: expected None for {self.config.target}, which knows views by their places")
@@ -141,11 +141,11 @@ class HyperPlanesNetwork(nn.Module):
         )
 
     def to_own(self, support: Views) -> Views:
-        """The views where the weights are, in their precision; weights of less than single are a ValueError."""
+        """The views with the device and dtype of the weights; ValueError for weights of less than single precision."""
         if self.rig.dtype.itemsize < 4:
             raise ValueError(
-                f"model: expected weights of single or double precision, got {self.rig.dtype}; make them single by "
-                "float(): what is faster in half precision is computed so"
+                f"model: expected weights of single or double precision, got {self.rig.dtype}; make them single with "
+                "float(): what is faster in half precision is computed in it"
             )
         return support.to(self.rig.device, self.rig.dtype)
 
@@ -154,12 +154,12 @@ class HyperPlanesNetwork(nn.Module):
         return self.updates([context])[0]
 
     def updates(self, contexts: Sequence[SupportContext], *, mixed_precision: bool = False) -> list[Parameters]:
-        """The updates of several objects, which are read in one batch; as `update`.
+        """As `update`, of several objects in one batch.
 
         Args:
             contexts: of the objects.
-            mixed_precision: the convolutions and matrix products of a hypernetwork in single precision are computed
-                in bfloat16 (`torch.autocast`). Its weights and the updates keep their precision.
+            mixed_precision: compute the convolutions and matrix products of a single-precision hypernetwork in bfloat16
+                (`torch.autocast`). Its weights and the updates keep their precision.
         """
         if self.hypernetwork is None:
             return [Parameters() for _ in contexts]
@@ -188,7 +188,7 @@ class HyperPlanesNetwork(nn.Module):
         )
 
     def finer(self, weights: Parameters, cells: int) -> Parameters:
-        """Nearly the same fields by weights that have room for more detail (`Target.finer`)."""
+        """Weights of nearly the same fields with more capacity for detail (`Target.finer`)."""
         result = Parameters(weights)
         for name, network in self.targets.items():
             found = network.finer(weights.under(name), cells)
@@ -196,10 +196,10 @@ class HyperPlanesNetwork(nn.Module):
         return result
 
     def rendering_field(self, context: SupportContext, parameters: Parameters) -> AdaptedField:
-        """As `field`; one that judges what views see takes colours from those that see the surface of its density.
+        """As `field`, but a field that uses visibility takes colours from views that see the surface of its density.
 
-        The visual hull knows no hollows: by it, what lies in the seat of an armchair takes colours from views that do
-        not see it. Training and gradient steps do without.
+        The visual hull has no hollows: with it, the seat of an armchair gets colours of views that do not see it.
+        Training and gradient steps use the hull.
         """
         by_hull = self.field(context, parameters)
         if not self.target.permutation_invariant:
@@ -211,16 +211,16 @@ class HyperPlanesNetwork(nn.Module):
 
     @torch.no_grad()
     def adapted_weights(self, context: SupportContext) -> Parameters:
-        """Theta + delta as they are in use, whatever mode the model is in; they stay when the model is trained on."""
+        """Theta + delta in evaluation mode, whatever the mode of the model; later training does not change them."""
         with in_use(self):
             update = self.update(context)
             found = self.theta + update
         return Parameters((name, value if name in update else value.clone()) for name, value in found.items())
 
     def live_pixels_of(self, context: SupportContext, views: Views) -> Tensor | None:
-        """Flat indices of the pixels of views that look into the hull; None where all are drawn from.
+        """Flat indices of the pixels of views whose rays meet the hull; None if rays are drawn from all pixels.
 
-        Pixels at which a reflection is known to be wrong are none of them.
+        Pixels in which a reflection is known to be wrong are left out.
         """
         if not self.config.sampling.needs_occupancy:
             return None
@@ -231,16 +231,16 @@ class HyperPlanesNetwork(nn.Module):
 
 
 _in_use: dict[nn.Module, tuple[int, dict[nn.Module, bool]]] = {}
-"""By how many threads modules are used, and which of their parts were trained before."""
+"""How many threads use each module, and the training modes of its parts before."""
 
 _counting = Lock()
 
 
 @contextmanager
 def in_use(module: nn.Module) -> Generator[None]:
-    """The module as it is used and not trained (batch statistics), and afterwards as it was.
+    """Evaluation mode for the module while the context lasts.
 
-    Several threads may use it at once: it is as it was again when the last of them has ended.
+    Several threads may use it at once: the earlier mode is restored when the last of them has ended.
     """
     with _counting:
         users, before = _in_use.get(module, (0, {part: part.training for part in module.modules()}))

@@ -1,8 +1,8 @@
-"""Poses refined by the pictures themselves, before a field is adapted to them.
+"""Refinement of poses from the images, before a field is adapted to them.
 
-A grid of density and colour is optimised together with a small motion of each camera, by rays of all views, from small
-pictures and few cells to larger ones: at first only coarse shapes pull at the poses (Lin et al. 2021, "BARF"). The grid
-is then thrown away. It is no field of ours: those look colours up in the views, and so hide what is wrong with a pose.
+A grid of density and colour is optimised together with a small motion of each camera, on rays of all views, from small
+images and few cells to larger ones, so that poses are first fitted to coarse shapes (Lin et al. 2021, "BARF"). The grid
+is then discarded. Fields of this package would hide errors of poses, since they look colours up in the views.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ LEVELS = ((32, 32, 200), (64, 48, 200), (128, 64, 200))
 FEWEST_VIEWS = 5
 RAYS = 2048
 GRID_RATE, POSE_RATE = 0.2, 5e-3  # of Adam
-FIXED = 40  # steps before the cameras move: the first grid is too large, and would pull at them
-FINAL_RATE = 0.1  # of the rate of the poses, at the last step
-SAMPLES = 1.5  # along a ray, for each cell of the grid along an axis
-OUTSIDE, INSIDE = -6.0, 0.0  # what the grid begins with, before softplus: optical depth of a cell
-UNKNOWN = -3.0  # where there are no masks
-EMPTY = 0.02  # optical depth of cells that are left out, but for two beside others
-VOTES = 0.2  # of the masks must rule a cell out: those of wrong poses carve
-MARGIN = 0.08  # of the longer side of a picture: how far from the masks rays are drawn
+FIXED = 40  # steps before the cameras move: the first grid is too large and would misplace them
+FINAL_RATE = 0.1  # fraction of the rate of the poses at the last step
+SAMPLES = 1.5  # along a ray, per cell of the grid along an axis
+OUTSIDE, INSIDE = -6.0, 0.0  # initial values of the grid, before softplus: optical depth of a cell
+UNKNOWN = -3.0  # the same without masks
+EMPTY = 0.02  # optical depth up to which cells are skipped, if they are more than two cells from others
+VOTES = 0.2  # fraction of the masks that must exclude a cell to carve it, as some poses are wrong
+MARGIN = 0.08  # distance from the masks within which rays are drawn, as a fraction of the longer side of an image
 
 Grid = Float[Tensor, "channel x y z"]
 
 
 @dataclass(frozen=True)
 class Refined:
-    """Views with other cameras.
+    """Views with refined cameras.
 
     Attributes:
-        views: the same pictures.
-        turned: degrees by which each camera was turned about the middle of the bounds.
+        views: the same images.
+        turned: degrees by which each camera was rotated about the centre of the bounds.
     """
 
     views: Views
@@ -59,10 +59,10 @@ class Refined:
 
 
 class _MovedCameras(nn.Module):
-    """Cameras that move as rigid bodies about the middle of the bounds.
+    """Cameras with rigid motions about the centre of the bounds.
 
-    There a turn and a shift do different things to a picture; about its own centre a camera's turn is nearly a shift.
-    Their focal lengths stay: one that was wrong by 3 % came back by 0.2 %, its cameras moved away instead.
+    There a rotation and a translation change an image differently; about the camera's own centre, a rotation is nearly
+    a translation. Focal lengths are fixed: one that was wrong by 3 % changed by 0.2 %, and the cameras moved instead.
     """
 
     def __init__(self, cameras: PinholeCamera, bounds: Sphere) -> None:
@@ -71,7 +71,7 @@ class _MovedCameras(nn.Module):
         self.twist = nn.Parameter(torch.zeros(cameras.batch_size, 6))  # radians about x, y, z, shift in radii
 
     def relative(self) -> Float[Tensor, "view 6"]:
-        """The motions, less what all have in common: the world stays where it was."""
+        """The motions minus their mean, so that the world does not move."""
         return self.twist - self.twist.mean(0)
 
     def forward(self) -> PinholeCamera:
@@ -89,18 +89,18 @@ class _MovedCameras(nn.Module):
 
 
 def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], None] | None = None) -> Refined:
-    """Views whose cameras fit their pictures better, where they did not fit well.
+    """Views whose cameras fit the images better, if they did not fit well.
 
-    Poses that are wrong by some degrees come back to a fraction of a pixel (docs/adaptation.md). Those that are right
-    to a tenth of a pixel become worse: compare both on views that a field is not shown.
+    Poses that are off by some degrees are corrected to a fraction of a pixel (docs/adaptation.md). Poses that are right
+    to a tenth of a pixel become worse: compare both on held-out views.
 
     Args:
         views: of one object, with or without masks, without lens distortion.
         seed: of rays and samples.
-        on_step: called with the number of steps done and that of all.
+        on_step: called with the number of steps done and the total.
 
     Returns:
-        The views on the CPU in single precision; the mean motion of all cameras is none.
+        The views on the CPU in single precision; the mean motion of the cameras is zero.
 
     Raises:
         ValueError: fewer than five views, or cameras with lens distortion.
@@ -116,7 +116,7 @@ def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], N
     motion = Adam([cameras.twist], betas=(0.9, 0.99))
     grid, done, total = _first_grid(views, LEVELS[0][1]), 0, sum(steps for _, _, steps in LEVELS)
     for pixels, side, steps in LEVELS:
-        # the same object in larger pictures and smaller cells
+        # the same object with larger images and smaller cells
         small = views.resized(pixels)
         among = _near_masks(small)
         grid = resampled_grid(grid.detach(), side)
@@ -124,7 +124,7 @@ def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], N
         grid = grid.clone().requires_grad_(True)
         content = Adam([grid], lr=GRID_RATE, betas=(0.9, 0.99))
         for _ in range(steps):
-            # rays of the cameras as they stand now, and how far the grid is from what they show
+            # rays of the current cameras, and the error of the grid
             shown = replace(small, cameras=camera.resized(cameras(), *small.size))
             rays, truth, opacity = shown.sample_masked_rays(RAYS, generator=generator, among=among)
             loss = _loss(grid, occupancy, rays, truth, None if views.masks is None else opacity[:, 0], generator)
@@ -150,16 +150,16 @@ def _loss(
     opacity: Float[Tensor, " ray"] | None,
     generator: torch.Generator,
 ) -> Tensor:
-    """Squared error of the colours of rays, and of their opacity where masks say it."""
+    """Squared error of the colours of rays, and of their opacity if there are masks."""
     hit: Bool[Tensor, " ray"] = rays.far > rays.near
     near, length = rays.near[hit][:, None], (rays.far - rays.near)[hit][:, None]
-    # one sample in each interval of a ray, (ray, sample), and which of them lie in cells that are not empty
+    # one sample in each interval of a ray, (ray, sample), and which of them lie in non-empty cells
     count = int(SAMPLES * grid.shape[1])
     edges = torch.linspace(0, 1, count + 1)
     where = near + length * (edges[:-1] + torch.rand(len(near), count, generator=generator) / count)
     points = rays.origins[hit][:, None] + where[..., None] * rays.directions[hit][:, None]
     inside = occupancy.contains(points.detach())
-    # their density and colour, composited with nothing between them
+    # their density and colour; all others are empty
     values = interpolate_grid(grid, points[inside], occupancy.bounds)
     density = torch.zeros(inside.shape).index_put(inside.nonzero().unbind(1), softplus(values[:, 0]) / occupancy.voxel)
     colour = torch.zeros(points.shape).index_put(inside.nonzero().unbind(1), torch.sigmoid(values[:, 1:]))
@@ -169,7 +169,7 @@ def _loss(
 
 
 def _near_masks(views: Views) -> Int[Tensor, " pixel"] | None:
-    """Flat indices (view, row, column) of the pixels on the masks and around them; None without masks."""
+    """Flat indices (view, row, column) of the pixels in the masks and around them; None without masks."""
     if views.masks is None:
         return None
     reach = max(1, round(MARGIN * max(views.size)))
@@ -177,7 +177,7 @@ def _near_masks(views: Views) -> Int[Tensor, " pixel"] | None:
 
 
 def _first_grid(views: Views, side: int) -> Grid:
-    """A grey hull of the masks, which several of them have to rule a cell out of, or thin fog."""
+    """A grey visual hull, from which a cell is carved by several masks, or thin fog without masks."""
     grid = torch.zeros(4, side, side, side)
     grid[0] = UNKNOWN
     if views.masks is not None:

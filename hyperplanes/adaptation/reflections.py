@@ -1,4 +1,4 @@
-"""Reflections of views: a symmetric object is seen from more sides than it was photographed from."""
+"""Reflections of views: further views of a symmetric object."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from hyperplanes.views import Views, join_views, moved
 
 __all__ = ["HULL_SIDE", "SHOWN", "UNKNOWN", "handicaps", "images_by", "reflected", "with_reflections"]
 
-HULL_SIDE = 96  # voxels an axis of the hull in which parts that are not symmetric are looked for
-SHOWN = 0.9  # opacity of a mask from which on a pixel shows the object
-UNKNOWN = 0.97  # opacity where a reflection is known to be wrong: nothing is carved, and its colour does not count
-HANDICAP = 0.05  # penalty of reflections as planes: light falls from one side, and writing is reversed
-ROTATED = 0.2  # likewise of those about other planes, which few objects are the same about in each detail
+HULL_SIDE = 96  # voxels an axis of the hull in which asymmetric parts are looked for
+SHOWN = 0.9  # least opacity of a mask in a pixel that shows the object
+UNKNOWN = 0.97  # opacity of pixels in which a reflection is known to be wrong: not carved, and colour not used
+HANDICAP = 0.05  # penalty of reflections as planes: light comes from one side, and writing is reversed
+ROTATED = 0.2  # the same for those about other planes, about which few objects are symmetric in every detail
 
 
 def reflected(views: Views, plane: Plane) -> Views:
-    """The views of the mirror image of an object: the same pictures, flipped, by cameras that are reflected.
+    """The views of the mirror image of an object: flipped images with reflected cameras.
 
     Args:
         views: of the object.
@@ -37,7 +37,7 @@ def reflected(views: Views, plane: Plane) -> Views:
 
 
 def images_by(views: Views, symmetry: Symmetry) -> Views:
-    """The views, after them their reflections about the plane, and then the rotations of both.
+    """The views, followed by their reflections about the plane, and then by the rotations of both.
 
     Args:
         views: of the object.
@@ -51,7 +51,7 @@ def handicaps(given: int, symmetry: Symmetry) -> Float[Tensor, " view"]:
     """The penalties of the views of `images_by` as planes.
 
     Args:
-        given: how many of them were given.
+        given: number of views without reflections.
         symmetry: of the object.
     """
     result = torch.full((given * symmetry.images,), ROTATED)
@@ -62,15 +62,15 @@ def handicaps(given: int, symmetry: Symmetry) -> Float[Tensor, " view"]:
 
 @torch.no_grad()
 def with_reflections(support: Views, symmetry: Symmetry | None, known: Occupancy | None = None) -> Views:
-    """The views, and after them their reflections (`images_by`).
+    """The views, followed by their reflections (`images_by`).
 
-    Few things are symmetric in all of their parts. What views show, and the visual hull of views and reflections does
-    not hold, is such a part. Where it would be in a reflection, the opacity is UNKNOWN.
+    Few objects are symmetric in all parts. Whatever views show outside the visual hull of views and reflections is an
+    asymmetric part. Where it would appear in a reflection, the opacity is UNKNOWN.
 
     Args:
-        support: of an object that is symmetric, but for some parts.
-        symmetry: None leaves the views as they are.
-        known: the visual hull of the views, HULL_SIDE voxels an axis; carved where absent.
+        support: of an object that is symmetric, except for some parts.
+        symmetry: None returns the views unchanged.
+        known: the visual hull of the views, HULL_SIDE voxels an axis; computed by default.
     """
     if symmetry is None:
         return support
@@ -87,7 +87,7 @@ def with_reflections(support: Views, symmetry: Symmetry | None, known: Occupancy
 
 
 def _asymmetric_parts(support: Views, reflections: Views, found: Occupancy) -> Occupancy:
-    """The voxels of the hull of views that lie where these show what their hull with reflections does not hold."""
+    """The voxels of the hull of views that project to pixels which the hull with reflections does not cover."""
     assert support.masks is not None
     assert reflections.masks is not None
     common = carve(reflections.masks, reflections.cameras, found.bounds, HULL_SIDE, within=found)

@@ -1,9 +1,9 @@
-"""Residual correction: what pictures of a field lack where its support views show the same places is added to new ones.
+"""Residual correction: residuals of the support views of a field are blended and added to new pictures.
 
-A field cannot show everything that its support views do: its surfaces are soft, and thin parts half transparent. How
-far each support view lies above what the field shows from its camera is known. These residuals are images, so a new
-view takes them over as image-based rendering takes over colours (Buehler et al. 2001, "Unstructured Lumigraph
-Rendering"): from where the support views see the same surface, the more the closer their rays are to its own.
+A field cannot reproduce all of its support views: its surfaces are soft, and thin parts half transparent. The residual
+of each support view, its image minus the picture that the field renders from its camera, is known. Residuals are
+images, so new views blend them as image-based rendering blends colours (Buehler et al. 2001, "Unstructured Lumigraph
+Rendering"): from support views that see the same surface, with more weight the closer their rays are.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from hyperplanes.views import Views
 
 __all__ = ["CorrectedField", "ResidualField", "are_corrected", "corrected_field"]
 
-SHARPNESS = 10.0  # of weights over 1 - the cosine of the angle between rays: a third at 27 degrees
-WIDEST = 0.5  # of that, from which on the weight is 0: 60 degrees
-TOLERANCE = 0.25  # of the radius, by which a support view may see a surface in front or behind, at a weight of 1 / e
-DOUBT = 0.3  # weight of no residual at all
-FAINT, SOLID = 0.01, 1 / 3  # opacity of a pixel from which on it is corrected, and from which on wholly
-PAIRS = 1 << 18  # of a pixel and a support view, at once
+SHARPNESS = 10.0  # of weights as a function of 1 - the cosine of the angle between rays: a third at 27 degrees
+WIDEST = 0.5  # value of 1 - cosine from which on the weight is 0: 60 degrees
+TOLERANCE = 0.25  # distance from the surface that a support view sees, in radii, at which the weight is 1 / e
+DOUBT = 0.3  # weight of a residual of zero
+FAINT, SOLID = 0.01, 1 / 3  # opacities from which on a pixel is corrected in part, and in full
+PAIRS = 1 << 18  # of a pixel and a support view, processed at once
 VIEWS = 8  # support views that are rendered together
 MOST_PIXELS = 1 << 21  # of support views, such as 52 of 200x200, which take 20 s of two cores
 
-_rendering = RLock()  # support views: two threads that need the same ones render them once
+_rendering = RLock()  # so that two threads that need the same support views render them once
 
 
 class ResidualField:
-    """A field whose pictures are corrected by its support views; opacity and depth stay those of the field.
+    """A field with residual correction of its pictures; opacity and depth stay those of the field.
 
-    The support views near a new one are rendered when they are first needed, and kept: 20 bytes a pixel.
+    Support views near a new view are rendered on first use and kept, at 20 bytes a pixel.
     """
 
     def __init__(self, uncorrected: Renderable, views: Views) -> None:
-        """A field and what it was made of.
+        """A field and its support views.
 
         Args:
             uncorrected: the field.
-            views: its support views, with their colours over what the field renders behind the object.
+            views: its support views, over the background that the field renders.
         """
         count, (height, width) = len(views), views.size
         needed = 20 * count * height * width
@@ -65,7 +65,7 @@ class ResidualField:
         self.uncorrected = uncorrected
         self.views = views
         self._planes = ImagePlanes(views.images.new_zeros(count, 5, height, width), views.cameras, 0.0, exact=True)
-        self._known: set[int] = set()  # views whose residual, depth times opacity, and opacity the planes have
+        self._known: set[int] = set()  # views with residual, depth times opacity, and opacity in the planes
 
     def __repr__(self) -> str:
         return f"ResidualField({self.uncorrected!r}, {self.views!r})"
@@ -74,7 +74,7 @@ class ResidualField:
     @without_autocast
     @torch.no_grad()
     def render(self, cameras: PinholeCamera) -> Pictures:
-        """The pictures of cameras, with what the field lacks in the support views.
+        """The corrected pictures of cameras.
 
         Args:
             cameras: any number, one image size, on any device and in any precision.
@@ -86,10 +86,10 @@ class ResidualField:
 
     @torch.no_grad()
     def correct(self, pictures: Pictures, cameras: PinholeCamera) -> Pictures:
-        """The pictures that the field has of cameras, with what it lacks in the support views.
+        """Corrected pictures.
 
         Args:
-            pictures: one a camera.
+            pictures: of the field, one a camera.
             cameras: as in `render`.
         """
         images, cameras = pictures.images.clone(), camera.to(cameras, pictures.images.device)
@@ -104,10 +104,10 @@ class ResidualField:
 
     @torch.no_grad()
     def prepare(self, on_view: Callable[[int], None] | None = None) -> None:
-        """Render all support views now, instead of when they are needed.
+        """Render all support views now, instead of on first use.
 
         Args:
-            on_view: called with how many of them are done.
+            on_view: called with the number of views done.
         """
         for first in range(0, len(self.views), VIEWS):
             last = min(first + VIEWS, len(self.views))
@@ -116,7 +116,7 @@ class ResidualField:
                 on_view(last)
 
     def _blended(self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]) -> Tensor:
-        """The weighted mean of the residuals of support views at points that are seen in these directions."""
+        """The weighted mean of the residuals of support views at points seen along these directions."""
         points, directions = points.to(self._planes.images), directions.to(self._planes.images)
         size = max(1, PAIRS // len(self.views))
         parts = list(zip(points.split(size), directions.split(size), strict=True))
@@ -136,19 +136,19 @@ class ResidualField:
             apart = found.distances - (moment / opacity.clamp_min(1e-3)).squeeze(-1)
             aside = 1 - (found.directions * along[:, None]).sum(-1)
             weights = (torch.exp(-SHARPNESS * aside) - math.exp(-SHARPNESS * WIDEST)).clamp_min(0)
-            # outside of a picture opacity is 0, so that the surface seems to be at the camera, and the weight is 0
+            # outside of an image opacity is 0, so the surface seems to be at the camera, and the weight is 0
             weights = weights * torch.exp(-(apart / (TOLERANCE * self.views.bounds.radius)).square())
             blended.append((weights[..., None] * residual).sum(1) / (weights.sum(1, keepdim=True) + DOUBT))
         return torch.cat(blended)
 
     def _near(self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]) -> Bool[Tensor, " view"]:
-        """The support views that one of the points has a weight of."""
+        """The support views with a weight above 0 for any of the points."""
         offsets = points[:, None] - camera.centres(self._planes.cameras).to(points)
         cosines = (torch.nn.functional.normalize(offsets, dim=-1) * directions[:, None]).sum(-1)
         return (1 - cosines < WIDEST).any(0)
 
     def _compute(self, chosen: list[int]) -> None:
-        """Residual, depth times opacity, and opacity of support views that are not known yet."""
+        """Computes residual, depth times opacity, and opacity of the chosen support views, unless done already."""
         with _rendering:
             missing = [view for view in chosen if view not in self._known]
             for first in range(0, len(missing), VIEWS):
@@ -164,12 +164,12 @@ class ResidualField:
 class CorrectedField(AdaptedField):
     """A field whose pictures are corrected by residuals of its support views.
 
-    Densities, colours, rays and meshes are those of the field, and so are pictures by another sampler than its own or
-    with so many rays a pixel as the caller says: residuals are of the pictures that it has by default.
+    Densities, colours, rays and meshes are those of the field, and so are pictures with a given sampler or `antialias`:
+    residuals are computed for pictures with the defaults.
 
     Attributes:
         uncorrected: the field.
-        residuals: what corrects its pictures.
+        residuals: the correction.
     """
 
     uncorrected: AdaptedField = field(kw_only=True)
@@ -207,7 +207,7 @@ class CorrectedField(AdaptedField):
         *,
         mixed_precision: bool = True,
     ) -> Pictures:
-        """As `AdaptedField.render`, corrected where neither a sampler nor rays a pixel are given."""
+        """As `AdaptedField.render`, corrected if neither `sampling` nor `antialias` is given."""
         pictures = self.uncorrected.render(cameras, sampling, antialias, mixed_precision=mixed_precision)
         if sampling is not None or antialias is not None:
             return pictures
@@ -215,11 +215,13 @@ class CorrectedField(AdaptedField):
 
 
 def are_corrected(network: HyperPlanesNetwork, support: Views) -> bool:
-    """Whether pictures of what a model makes of an object are corrected: the model says so, and it does not take long.
+    """Whether pictures of the field that a model makes are corrected.
+
+    The model must be configured so, and there must be MANY_VIEWS or more, with masks and MOST_PIXELS at most.
 
     Args:
         network: the model.
-        support: the views of the object: MANY_VIEWS with masks or more, which have MOST_PIXELS at most.
+        support: the views of the object.
     """
     height, width = support.size
     enough = len(support) >= MANY_VIEWS and support.masks is not None
@@ -227,7 +229,7 @@ def are_corrected(network: HyperPlanesNetwork, support: Views) -> bool:
 
 
 def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support: Views) -> AdaptedField:
-    """A field whose pictures are corrected where they are to be (`are_corrected`).
+    """A field with residual correction if `are_corrected`.
 
     Args:
         network: the model.
@@ -235,7 +237,7 @@ def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support:
         support: the views of the object.
 
     Returns:
-        A `CorrectedField`, or the field.
+        A `CorrectedField`, or the field itself.
     """
     if not are_corrected(network, support):
         return adapted

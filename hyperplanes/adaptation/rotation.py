@@ -1,4 +1,4 @@
-"""Rotations of an object about the vertical axis of its scene: of its views, its symmetry and its field."""
+"""Rotations about the vertical axis of a scene, of the views, the symmetry and the field of an object."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ class Rotation:
     """A rotation of an object, the same for all of its views.
 
     Attributes:
-        angle: in radians, about the vertical axis through the middle of the scene; by a quarter turn the z axis is
-            mapped onto the x axis.
+        angle: in radians, about the vertical axis through the centre of the scene; a quarter turn maps the z axis to
+            the x axis.
     """
 
     angle: float = 0.0
 
     @property
     def inverse(self) -> Rotation:
-        """The rotation back."""
+        """The inverse rotation."""
         return Rotation(-self.angle)
 
     def about(self, bounds: Sphere) -> Float[Tensor, "4 4"]:
-        """The map of the world, in float64."""
+        """The transform of world coordinates, in float64."""
         return rotation_about(bounds.centre, self.angle)
 
     def views(self, views: Views) -> Views:
-        """The views of the rotated object: the same pictures, whose cameras are rotated with it."""
+        """The views of the rotated object: the same images with rotated cameras."""
         return moved(views, self.about(views.bounds)) if self.angle else views
 
     def symmetry(self, symmetry: Symmetry | None, bounds: Sphere) -> Symmetry | None:
@@ -54,7 +54,7 @@ class Rotation:
         return symmetry.moved(self.about(bounds)) if symmetry is not None and self.angle else symmetry
 
     def field(self, field: AdaptedField) -> AdaptedField:
-        """The field of the rotated object, which renders as the other one does by cameras that are rotated back."""
+        """The field of the rotated object, which renders the given field from cameras that are rotated back."""
         if not self.angle:
             return field
         bounds = field.occupancy.bounds
@@ -69,7 +69,7 @@ class Rotation:
         )
 
     def _occupancy(self, occupancy: Occupancy) -> Occupancy:
-        """Voxels that hold all that the rotated ones hold."""
+        """Voxels that cover the rotated ones."""
         occupied = torch.zeros_like(occupancy.occupied)
         occupied.view(-1)[occupancy.index(_moved(occupancy.centres(), self.about(occupancy.bounds)))] = True
         return replace(occupancy, occupied=occupied).dilated()  # half a diagonal of a voxel is less than one

@@ -1,4 +1,4 @@
-"""Pictures of a field averaged with those of the visual hull, by shares that held-out views and each pixel decide."""
+"""Pictures of a field averaged with those of the visual hull; held-out views and each pixel decide the weights."""
 
 from __future__ import annotations
 
@@ -43,25 +43,25 @@ __all__ = [
     "tuned_field",
 ]
 
-CAUTION = 1.5  # power of the share that shows held-out views best: few views, so less (docs/image-based.md, "Stacking")
-OVERRULED = 0.8  # share of the hull from which on it is its surface that counts
-MARGIN = 0.02  # of the squared error, by which it has to be lower to be worth a second picture
+CAUTION = 1.5  # power of the best share for the few held-out views, to be cautious (docs/image-based.md, "Stacking")
+OVERRULED = 0.8  # share of the hull above which its surface is used
+MARGIN = 0.02  # relative reduction of the squared error that is worth a second picture
 
 Pixels = TypeVar("Pixels", Rendered, Pictures)
 
 
 @dataclass(frozen=True, repr=False)
 class StackedField(AdaptedField):
-    """A field whose pictures are means of its own and of those of another one (Wolpert 1992, "Stacked generalization").
+    """A field whose pictures are averaged with those of another field (Wolpert 1992, "Stacked generalization").
 
     Densities, colours and meshes are those of the field alone.
 
     Attributes:
         other: the other field.
-        share: of the pictures of the other field in the mean.
-        overruled: whether the other field is the learned one, and the field itself the visual hull.
-        gate: what makes a share of every pixel of that; None leaves all alike.
-        views: how many are shown.
+        share: of the other field in the average.
+        overruled: whether the other field is the learned one, and this field the visual hull.
+        gate: turns the share into one for each pixel; with None, all pixels have the same.
+        views: number of support views.
     """
 
     other: AdaptedField = field(kw_only=True)
@@ -74,14 +74,15 @@ class StackedField(AdaptedField):
         return f"{type(self).__name__}({super().__repr__()}, {self.share:.0%} of {self.other!r})"
 
     def with_sampling(self, sampling: Sampler) -> AdaptedField:
-        """As `AdaptedField.with_sampling`, of the learned field; the visual hull keeps its own."""
-        if self.overruled:
-            return replace(self, other=self.other.with_sampling(sampling))
-        return super().with_sampling(sampling)
+        """As `AdaptedField.with_sampling`; the visual hull keeps its own sampler."""
+        own, other = self._samplers(sampling)
+        return replace(
+            self, sampling=own or self.sampling, other=self.other.with_sampling(other) if other else self.other
+        )
 
     @without_autocast
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
-        """The mean of the pixels of both, as `AdaptedField.trace`."""
+        """As `AdaptedField.trace`, averaged over both fields."""
         own = super().trace(rays, generator, differentiable=differentiable)
         if not self.share and self.gate is None:
             return own
@@ -98,8 +99,8 @@ class StackedField(AdaptedField):
         *,
         mixed_precision: bool = True,
     ) -> Pictures:
-        """The mean of the pictures of both, as `AdaptedField.render`; another sampler is the learned field's alone."""
-        of_own, of_other = (None, sampling) if self.overruled else (sampling, None)
+        """As `AdaptedField.render`, averaged over both fields; the visual hull keeps its own sampler."""
+        of_own, of_other = self._samplers(sampling)
         own = partial(super().render, cameras, of_own, antialias, mixed_precision=mixed_precision)
         if not self.share and self.gate is None:
             return own()
@@ -108,8 +109,12 @@ class StackedField(AdaptedField):
             return self._mean(own(), other())
         return self._mean(*at_once(own, other, self.occupancy.occupied.device))
 
+    def _samplers(self, sampling: Sampler | None) -> tuple[Sampler | None, Sampler | None]:
+        """The given sampler for whichever of the field and the other one is learned, None for the visual hull."""
+        return (None, sampling) if self.overruled else (sampling, None)
+
     def _mean(self, own: Pixels, other: Pixels) -> Pixels:
-        """The mean of colours and opacities, and the expected distance of what both show."""
+        """Averages colours and opacities, and depths weighted by opacity."""
         share = self._shares(own, other)
         opacity = torch.lerp(own.opacity, other.opacity, share)
         depth = torch.lerp(own.opacity * own.depth, other.opacity * other.depth, share) / opacity.clamp_min(1e-10)
@@ -118,7 +123,7 @@ class StackedField(AdaptedField):
         return replace(own, **{colour: colours}, opacity=opacity, depth=depth, samples=own.samples + other.samples)
 
     def _shares(self, own: Pixels, other: Pixels) -> Tensor:
-        """Of the other field in each pixel."""
+        """The share of the other field in each pixel."""
         if self.gate is None:
             return torch.full_like(own.opacity, self.share)
         if self.overruled:
@@ -128,18 +133,22 @@ class StackedField(AdaptedField):
 
 @dataclass(frozen=True, repr=False)
 class AveragedField(StackedField):
-    """A field after gradient steps, whose pictures are means with those of the field before them (`average`)."""
+    """A field after gradient steps, whose pictures are averaged with those of the field before them (`average`)."""
+
+    def _samplers(self, sampling: Sampler | None) -> tuple[Sampler | None, Sampler | None]:
+        """The given sampler for both, which are learned."""
+        return sampling, sampling
 
 
 @dataclass(frozen=True)
 class Learned:
-    """The part of a field that is a network.
+    """The learned part of a field.
 
     Attributes:
-        field: with what renders it.
-        share: of the hull beside it, over all pixels.
-        gate: what makes a share of every pixel of that, if anything does.
-        before: the field before gradient steps, if it is in the pictures.
+        field: of a network.
+        share: of the visual hull, over all pixels.
+        gate: turns the share into one for each pixel, if there is one.
+        before: the field before gradient steps, if pictures are averaged with it.
         average: its share.
     """
 
@@ -151,7 +160,7 @@ class Learned:
 
 
 def learned_part(adapted: AdaptedField) -> Learned:
-    """The part of a field that is a network, and what is beside it.
+    """The learned part of a field, and what its pictures are averaged with.
 
     Args:
         adapted: a field, stacked or not, in its canonical frame or in that of the scene.
@@ -170,21 +179,21 @@ def learned_part(adapted: AdaptedField) -> Learned:
 def stack(
     learned: AdaptedField, hull: AdaptedField, share: float, gate: GatingNetwork | None = None, views: int = FEWEST
 ) -> AdaptedField:
-    """Two fields as one: it has the mean of the pictures of both.
+    """Two fields as one, whose pictures are averages of those of both.
 
-    Densities are those of the first one, from which voxels and meshes come out better, unless next to nothing is left
-    of it in the pictures.
+    Densities are those of the first, from which voxels and meshes are better, unless it contributes almost nothing to
+    the pictures.
 
     Args:
         learned: a field that is not stacked.
         hull: another one.
-        share: of the second one in the pictures, in [0, 1].
-        gate: what makes a share of every pixel of that; without it all pixels are alike.
-        views: how many are shown, for the gate.
+        share: of the second in the pictures, in [0, 1].
+        gate: turns the share into one for each pixel; without it all pixels have the same.
+        views: number of support views, for the gate.
 
     Returns:
-        The first one alone where the share is 0 and there is no gate; with more than OVERRULED the `other` of the
-        result is the first one (`learned_part`).
+        The first field alone if the share is 0 and there is no gate. With more than OVERRULED, the `other` of the
+        result is the first field (`learned_part`).
 
     Raises:
         ValueError: a field that is stacked already.
@@ -197,20 +206,20 @@ def stack(
     shown, other = (hull, learned) if overruled else (learned, hull)
     share = 1 - share if overruled else share
     own = {each.name: getattr(shown, each.name) for each in fields(shown)}
-    own["symmetry"] = learned.symmetry  # that of the object, which the hull does not know
+    own["symmetry"] = learned.symmetry  # of the object; the hull has none
     return StackedField(**own, other=other, share=share, overruled=overruled, gate=gate, views=views)
 
 
 def average(tuned: AdaptedField, before: AdaptedField, share: float) -> AdaptedField:
-    """A field after gradient steps with the one before them as one: it has the mean of the pictures of both.
+    """A field after gradient steps, with pictures averaged with those of the field before them.
 
-    Steps on few views change what no view shows, too, partly for the worse. Their errors there are others than those
-    of the field before them, so that a mean has less of them (docs/adaptation.md).
+    Steps on few views also change what no view shows, partly for the worse. The errors there differ from those of the
+    field before, so an average has smaller ones (docs/adaptation.md).
 
     Args:
         tuned: the field after the steps, whose densities are those of the result.
-        before: the field before them.
-        share: of the latter.
+        before: the field before the steps.
+        share: of `before`.
     """
     own = {each.name: getattr(tuned, each.name) for each in fields(tuned)}
     return AveragedField(**own, other=before, share=share)
@@ -218,11 +227,11 @@ def average(tuned: AdaptedField, before: AdaptedField, share: float) -> AdaptedF
 
 @torch.no_grad()
 def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights: Parameters) -> AdaptedField:
-    """The field of given weights, stacked with the visual hull where the model is configured so.
+    """The field of given weights, stacked with the visual hull if the model is configured so.
 
-    The share of the hull is that of the object's own update (`hull_share`), whatever the weights are, or the one that
-    the model is configured with. From FEWEST views on the model's gating network, where it has one, makes a share of
-    every pixel of that.
+    The share of the hull is that for the object's own update (`hull_share`), whatever the weights are, or the one in
+    the configuration. With FEWEST views or more, the gating network of the model, if any, turns it into one for each
+    pixel.
 
     Args:
         network: the model.
@@ -254,17 +263,17 @@ def tuned_field(
 ) -> AdaptedField:
     """The field of weights after gradient steps, averaged with the one before them or with the visual hull.
 
-    The hull is mixed in by the model's gating network, where it has one, with MANY_VIEWS given views or more, their
-    reflections not counted. The network makes a share of every pixel, as where held-out views give the hull none. No
-    view is held out: gradient steps learn from all of them. Where pictures are corrected (`residuals.are_corrected`)
-    there is no hull in them: it brings nothing beside that (docs/image-based-measurements.md), and takes time.
+    The hull is used with MANY_VIEWS given views or more, not counting reflections, if the model has a gating network.
+    This computes the share of each pixel from an overall share of 0, since no view is held out: gradient steps learn
+    from all of them. If pictures are corrected (`residuals.are_corrected`), the hull is left out: it takes time and
+    gains nothing more (docs/image-based-measurements.md).
 
     Args:
         network: the model.
         context: the object.
         weights: of the field.
-        before: the weights before the steps, where their field is in the pictures.
-        share: of that.
+        before: the weights before the steps, if pictures are averaged with those of their field.
+        share: of that field.
     """
     tuned = network.rendering_field(context, weights)
     if before is not None:
@@ -277,17 +286,17 @@ def tuned_field(
 
 @torch.no_grad()
 def hull_share(trial: Trial | None) -> float:
-    """The share of `HullBlend` in the pictures of an object, by which views that are held out are shown best.
+    """The share of `HullBlend` in the pictures of an object that is best for held-out views.
 
-    What was learned may not fit an object of another kind, and where it does fit, the errors of both are different
-    ones, so that a mean has less of them. The squared error of pixels of held-out views decides.
+    What was learned may not fit an object of another kind, and if it does, the errors of both differ, so an average has
+    smaller ones. The squared error on pixels of held-out views decides.
 
     Args:
         trial: with views held out (`held_out.hold_out`).
 
     Returns:
-        The share, in [0, 1]: the best one (`best_share`) to the power of CAUTION. It is 0 where that lowers the squared
-        error by less than MARGIN, and without a trial.
+        The share in [0, 1]: the best one (`best_share`) to the power of CAUTION. It is 0 without a trial, or if it
+        lowers the squared error by less than MARGIN.
     """
     if trial is None:
         return 0.0
@@ -298,27 +307,27 @@ def hull_share(trial: Trial | None) -> float:
 
 
 def hull_field(context: SupportContext) -> AdaptedField:
-    """What `HullBlend` makes of an object.
+    """The field that `HullBlend` makes of an object.
 
     Args:
-        context: of a field that takes any number of views.
+        context: of an object, for a field that takes any number of views.
     """
     assert isinstance(context.planes, VisibilityPlanes)
     return HullBlend().adapt_to(context.planes)
 
 
 def best_share(one: Float[Tensor, "pixel 3"], other: Float[Tensor, "pixel 3"]) -> float:
-    """The share of the other in the mean of two predictions by which its squared error is least.
+    """The share of `other` that minimises the squared error of the average of two predictions.
 
     >>> best_share(torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]]))
     0.5
 
     Args:
-        one: errors of a prediction.
-        other: errors of another one.
+        one: errors of one prediction.
+        other: errors of the other.
 
     Returns:
-        The minimum of a quadratic function, in [0, 1]; 0 where both predictions are the same.
+        The minimum of a quadratic function, in [0, 1]; 0 if both predictions are the same.
     """
     between = other - one
     return float((-(one * between).sum() / between.square().sum().clamp_min(1e-12)).clamp(0, 1))

@@ -1,4 +1,4 @@
-"""Every object with the update of another one: the control that shows whether the update depends on the object."""
+"""Each object with the update of another: a control that shows whether the update depends on the object."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ __all__ = ["Swapped"]
 
 
 class Swapped:
-    """HyperPlanes with the update of the next object; planes and hull are the object's own.
+    """HyperPlanes with the update of the next object, and the planes and hull of the object itself.
 
     Args:
         model: with a hypernetwork.
-        objects: the support views of all objects that will be asked for, or of others; read once.
+        objects: the support views of all objects to adapt to, or of others; read once.
 
     Raises:
         ValueError: a model without a hypernetwork, or fewer than two objects.
@@ -45,7 +45,7 @@ class Swapped:
 
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
-        """The field of theta plus the update of the object after this one, all else as with its own update."""
+        """The field of theta plus the update of the next object, with everything else as for the object itself."""
         placed = to_canonical_frame(self.model, support)
         prepared = placed.context(self.model)
         known = list(self._updates)
@@ -57,5 +57,5 @@ class Swapped:
 
 
 def _digest(model: HyperPlanes, support: Views) -> str:
-    """Of the images as the model takes them: the same object in another precision has the same."""
+    """A hash of the images in the precision of the model, the same for an object in any precision."""
     return hashlib.sha256(model.to_own(support).images.detach().cpu().contiguous().numpy().tobytes()).hexdigest()

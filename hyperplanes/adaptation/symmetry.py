@@ -1,4 +1,4 @@
-"""The symmetry of an object, as its views tell it: their visual hull and its colours, without any weights."""
+"""Detection of the symmetry of an object from its views, by their visual hull and its colours, without weights."""
 
 from __future__ import annotations
 
@@ -30,42 +30,42 @@ from hyperplanes.views import Views
 
 __all__ = ["ReflectedHullBlend", "possible_symmetries", "symmetry_of"]
 
-FEWEST = 2  # views that planes are judged by: a single one contradicts none of them
-FEWEST_TO_REFINE = 10  # whose hull is near enough to the object to find planes by it
-MOST = 8  # of them that are looked at
-SINGLE_VIEW_ORDER = 3  # at least: by one view, many a car is the same from the front and from the back
-SINGLE_VIEW_TOLERANCE = 1.5  # of such an order: a car and a lamp without have 1.7, solids of revolution up to 1.3
-ALIKE = 1.02  # errors in that proportion tell nothing
-FOLDS, ONE_IN = 3, 6  # that are held out one after the other, each of one view in so many
-FEW = 16  # views, of which the held-out ones must gain more
-GAIN_OF_FEW, GAIN = 0.6, 0.1  # dB that reflections must bring to held-out views
-JUDGED_SIZE, PIXELS = 128, 1024  # of held-out views, along the longer side at most, and those compared of each fold
+FEWEST = 2  # views to judge planes by: a single one contradicts none
+FEWEST_TO_REFINE = 10  # views whose hull is near enough to the object to find planes by it
+MOST = 8  # views that are used
+SINGLE_VIEW_ORDER = 3  # at least: in one view, many cars look the same from the front and the back
+SINGLE_VIEW_TOLERANCE = 1.5  # of such an order: 1.7 for a car and a lamp without it, up to 1.3 for solids of revolution
+ALIKE = 1.02  # ratio of errors that counts as equal
+FOLDS, ONE_IN = 3, 6  # of cross-validation, each of which holds out one view in ONE_IN
+FEW = 16  # number of views below which held-out views must gain more
+GAIN_OF_FEW, GAIN = 0.6, 0.1  # dB that held-out views must gain with reflections
+JUDGED_SIZE, PIXELS = 128, 1024  # most pixels of views along the longer side, and pixels compared in each fold
 
 VERTICAL = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 AXES = (*VERTICAL, (0.0, 1.0, 0.0))
-"""Normals of planes that are tried."""
+"""Normals of the planes that are tried first."""
 
 
 @torch.no_grad()
 def symmetry_of(support: Views) -> Symmetry | None:
     """The planes about which an object looks symmetric, if there are any.
 
-    If an object is symmetric, the visual hull of its views and their reflections still shows the views. If not, this
-    hull is too small, or it has the colours of another part of the object. Silhouettes and colours are compared; no
-    weights are needed. Planes through the middle of the scene that are orthogonal to its axes are tried first. Where
-    none of them will do, vertical planes of all azimuths are. Of an object that is symmetric about a vertical plane,
-    likewise 2, 3, 4, 6 and 8 planes through one axis are tried.
+    If an object is symmetric, the visual hull of its views and their reflections still agrees with the views. If not,
+    this hull is too small, or has the colours of another part of the object. Silhouettes and colours are compared; no
+    weights are needed. Planes through the centre of the scene that are orthogonal to its axes are tried first. If none
+    of them fits, vertical planes of all azimuths are tried. For an object that is symmetric about a vertical plane, 2,
+    3, 4, 6 and 8 planes through one axis are also tried.
 
-    FEWEST_TO_REFINE views have a hull that is near enough to the object to look for planes by it: one near to the best
-    of those across the axes (`more_symmetric_plane`) or, where none will do, the vertical plane about which the hull is
-    most nearly symmetric (`most_symmetric_plane`). Several planes are not looked for. Those of the views that are held
-    out must be shown better with reflections of the others, by GAIN_OF_FEW or GAIN.
+    With FEWEST_TO_REFINE views, the hull is near enough to the object to look for planes by it: one near the best of
+    those orthogonal to an axis (`more_symmetric_plane`) or, if none fits, the vertical plane about which the hull is
+    most symmetric (`most_symmetric_plane`). Several planes are not looked for. Reflections of the other views must
+    improve held-out views by GAIN_OF_FEW or GAIN.
 
     Args:
-        support: views with masks, y up; MOST of them, those farthest apart, are looked at.
+        support: views with masks, y up; the MOST that are farthest apart are used.
 
     Returns:
-        The symmetry by which `HullBlend` shows the views best, if its squared error is at most TOLERANCE times that
+        The symmetry with which `HullBlend` renders the views best, if its squared error is at most TOLERANCE times that
         without reflections; None with fewer than FEWEST views, or without masks.
     """
     if support.masks is None or len(support) < FEWEST or not support.masks.any():
@@ -86,14 +86,14 @@ def symmetry_of(support: Views) -> Symmetry | None:
 
 @torch.no_grad()
 def possible_symmetries(view: Views) -> list[Symmetry]:
-    """The symmetries about vertical planes through the middle of a scene that a single view does not contradict.
+    """The symmetries about vertical planes through the centre of a scene that a single view does not contradict.
 
     Args:
         view: with a mask; y is up, as models are trained.
 
     Returns:
-        The most likely one where there are several planes through one axis: few other objects look like such a one.
-        Else those about one plane, of which a single view tells nothing more.
+        The most likely symmetry of several planes, if there is one, since few other objects look like that. Otherwise
+        those about one plane, between which a single view cannot decide.
     """
     judge = SymmetryJudge.of(view)
     errors = judge.errors([Plane.of_sphere(view.bounds, normal) for normal in VERTICAL])
@@ -105,7 +105,7 @@ def possible_symmetries(view: Views) -> list[Symmetry]:
 
 
 class ReflectedHullBlend:
-    """`HullBlend` of the views of an object that looks symmetric and of their reflections, by their handicaps."""
+    """`HullBlend` of the views of an object and, if it looks symmetric, of their reflections with penalties."""
 
     def adapt(self, support: Views) -> AdaptedField:
         """The hull of views and reflections, and its colours."""
@@ -113,17 +113,17 @@ class ReflectedHullBlend:
 
 
 def _least(errors: Mapping[Plane, float]) -> Plane:
-    """The first plane, in the order of AXES, whose error is the least or equal to that within ALIKE."""
+    """The first plane whose error is at most ALIKE times the least one."""
     return next(plane for plane, error in errors.items() if error <= ALIKE * min(errors.values()))
 
 
 def _of_many(support: Views, judge: SymmetryJudge, across: Mapping[Plane, float]) -> Symmetry | None:
-    """The symmetry about the best plane by the hull of many views, if views that are held out gain by it.
+    """The symmetry about the best plane for the hull of many views, if held-out views gain from it.
 
     Args:
         support: the views.
         judge: of some of them.
-        across: planes across the axes that will do, and their errors.
+        across: the fitting planes orthogonal to an axis, with their errors.
     """
     voxels = carved(support)
     if not voxels.occupied.any():
@@ -141,18 +141,17 @@ def _of_many(support: Views, judge: SymmetryJudge, across: Mapping[Plane, float]
 
 
 def _blend(support: Views, symmetry: Symmetry | None, known: Occupancy | None = None) -> AdaptedField:
-    """`HullBlend` of views, and of their reflections where there is a symmetry; `known` is the hull of the views."""
+    """`HullBlend` of views, and of their reflections if there is a symmetry; `known` is the hull of the views."""
     blend = HullBlend(side=HULL_SIDE)
     planes = blend.planes_of(with_reflections(support, symmetry, known), known)
     return blend.adapt_to(planes if symmetry is None else planes.with_handicaps(handicaps(len(support), symmetry)))
 
 
 def _held_out_gain(support: Views, symmetry: Symmetry) -> float:
-    """By how many dB of PSNR `HullBlend` shows held-out views better by the other views and their reflections.
+    """The gain in PSNR, in dB, of held-out views by `HullBlend` with reflections of the other views.
 
-    FOLDS times one view in ONE_IN is held out (cross-validation, Stone 1974), and the same pixels are compared. No
-    weights are needed: two views that are held out from a trained field tell less
-    (docs/image-based-measurements.md).
+    One view in ONE_IN is held out FOLDS times (cross-validation, Stone 1974), and the same pixels are compared. This
+    needs no weights, and says more than two views held out from a trained field (docs/image-based-measurements.md).
     """
     views = support.resized(JUDGED_SIZE)
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(0)).tolist()
@@ -165,13 +164,13 @@ def _held_out_gain(support: Views, symmetry: Symmetry) -> float:
 
 @dataclass(frozen=True)
 class Fold:
-    """Views of which some are held out.
+    """A fold of cross-validation, in which some views are held out.
 
     Attributes:
-        shown: the others.
+        shown: the other views.
         voxels: their visual hull.
-        rays: some of those held out that meet it.
-        truth: the colours of these.
+        rays: some rays of the held-out views that meet it.
+        truth: the true colours of these rays.
     """
 
     shown: Views
@@ -181,7 +180,7 @@ class Fold:
 
     @classmethod
     def of(cls, views: Views, held_out: list[int]) -> Fold:
-        """The fold in which these views are held out, by PIXELS rays at most."""
+        """The fold in which these views are held out, with PIXELS rays at most."""
         shown, others = views[sorted({*range(len(views))} - {*held_out})], views[held_out]
         voxels = carved(shown)
         among = live_pixels(voxels, others)
@@ -190,7 +189,7 @@ class Fold:
         return cls(shown, voxels, rays, truth)
 
     def error(self, symmetry: Symmetry | None) -> float:
-        """The squared error of the rays by the views that are shown, with their reflections if there is a symmetry."""
+        """The squared error of the rays for the other views, with their reflections if there is a symmetry."""
         if not len(self.rays):
             return 0.0
         found = _blend(self.shown, symmetry, self.voxels).trace(self.rays, differentiable=False).colour

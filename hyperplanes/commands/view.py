@@ -180,14 +180,14 @@ def _fields(
     if not steps:
         yield 0, model.adapt_to(context)
         return
-    descent, variables = make_descent(model, context, FineTuning(), views)
-    average = average_of(model, context, FineTuning(), variables)
+    descent = make_descent(model, context, FineTuning(), views)
+    average = average_of(model, context, FineTuning(), descent)
     for done in descent.run(steps):
         if done % EVERY and done != steps:
             yield done, None
             continue
         with torch.no_grad():
-            weights = Parameters((name, value.clone()) for name, value in variables.weights().items())
+            weights = Parameters((name, value.clone()) for name, value in descent.weights().items())
         yield done, tuned_field(model, context, weights, *average)
 
 

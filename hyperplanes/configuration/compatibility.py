@@ -131,12 +131,15 @@ def check_training(config: TrainingConfig, model: ModelConfig) -> None:
                 f"an object are plain fine-tuning, got {getattr(config, name)}"
             )
     if model.plane_dropout and model.initialisation is not None:
-        raise ValueError(f"model.plane_dropout: expected 0 for {model.method}, which hides no plane")
+        raise ValueError(
+            f"model.plane_dropout: expected 0 for {model.method}, which hides no plane, got {model.plane_dropout}"
+        )
     if config.rotations and not config.views:
         raise ValueError(f"training.rotations: expected 0 without training.views, got {config.rotations}")
     volume, grid = isinstance(model.hypernetwork, VolumeHyperNetworkConfig), getattr(model.network, "grid", 0)
     if config.volume_loss and not (volume and grid >= VOLUME_CHANNELS and config.views):
         raise ValueError(
             f"training.volume_loss: expected training.views, a hypernetwork of kind 'volume' and a grid of at "
-            f"least {VOLUME_CHANNELS} features, got another model or training"
+            f"least {VOLUME_CHANNELS} features, got views {list(config.views)}, {'one' if volume else 'no'} such "
+            f"hypernetwork and {grid} features"
         )

@@ -13,7 +13,7 @@ __all__ = ["AVERAGE", "CELLS", "FINE_VIEWS", "FRESH", "MANY_VIEWS", "RATES", "Fi
 
 Steps: TypeAlias = int | Literal["auto"]
 
-RATES: dict[str, tuple[str, float, float]] = {
+RATES: dict[str, tuple[Literal["adam", "muon"], float, float]] = {
     "weights": ("muon", 2e-3, 0.04),
     "hypernetwork": ("adam", 3e-4, 0.0),
 }
@@ -35,7 +35,7 @@ write half as many (docs/adaptation.md). Of so many views half as many learned s
 MANY_VIEWS = 10
 """Support views of a field of any number of them from which on fine-tuning begins with weights that are partly random,
 draws rays by contrast, and shows means with the visual hull; with fewer each of the three costs as often as it brings
-(docs/small-training.md, docs/adaptation.md, docs/image-based.md). By so many pictures are corrected, too
+(docs/small-training.md, docs/adaptation.md, docs/image-based.md). From this many views on, pictures are corrected too
 (`adaptation.residuals`)."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -47,14 +48,15 @@ class InitialisationConfig:
     def __post_init__(self) -> None:
         if self.method not in LEARNED:
             raise ValueError(f"method: expected one of {', '.join(LEARNED)}, got {self.method!r}")
+        if not 0 <= self.inner_rate < math.inf:
+            raise ValueError(f"inner_rate: expected a finite number of 0 or more, got {self.inner_rate}")
 
     def descent(self, rays: int | None = None, given: FineTuning | None = None) -> FineTuning:
-        """Plain gradient descent at a constant rate, `inner_rate`, on rays of all pixels, where nothing else is stated.
+        """Settings of plain gradient descent at a constant rate, `inner_rate`, on rays of all pixels by default.
 
         Args:
-            rays: a step; those of a new object where absent.
-            given: settings whose optimiser and rates, where they state any, and whose seed are kept. The rates of
-                another optimiser than "sgd" fall to `given.final_rate_factor`.
+            rays: per step; by default `test_rays`.
+            given: settings that are kept, except `trainable`, `rays` and, with "sgd", `final_rate_factor`, which is 1.
         """
         given = given or FineTuning()
         optimiser = given.optimiser or "sgd"

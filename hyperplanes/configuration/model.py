@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from hyperplanes.configuration.initialisation import InitialisationConfig
 from hyperplanes.fields import TargetConfig, find_targets
@@ -17,9 +17,7 @@ from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.utilities.checkpoints import CheckpointError, read_json
 from hyperplanes.utilities.settings import SettingsError, choose_by_tag, flattened, structure, tagged
 
-__all__ = ["ORDERS", "ModelConfig"]
-
-ORDERS = ("matched", "file")
+__all__ = ["ModelConfig"]
 
 SAMPLERS = {"hierarchical": Hierarchical, "ray_marching": RayMarching}
 """Samplers by the entry `protocol`."""
@@ -34,7 +32,7 @@ class ModelConfig:
     """What a model is made of; saved beside its weights.
 
     Attributes:
-        target: which field: "point_multiplane", "multiplane", "nerf" or "image_based".
+        target: which field: a name of `fields.find_targets()`.
         network: the shape of the target, of the dataclass that the field names (`Target.config_type`).
         hypernetwork: the shape of the hypernetwork, which reads images or a volume; None for one set of weights for all
             objects.
@@ -77,7 +75,7 @@ class ModelConfig:
     coarse_network: bool = False
     sampling: Hierarchical | RayMarching = field(default_factory=RayMarching)
     hull_resolution: Annotated[int, range(1, 513)] = 64
-    order: str = "matched"
+    order: Literal["matched", "file"] = "matched"
     plane_dropout: float = 0.0
     stacked: bool = False
     hull_share: float = 0.0
@@ -99,8 +97,6 @@ class ModelConfig:
             raise ValueError(f"azimuth: expected a finite angle in radians, got {self.azimuth}")
         if self.stacked and self.hull_share:
             raise ValueError(f"hull_share: expected 0 where views decide it (stacked), got {self.hull_share}")
-        if self.order not in ORDERS:
-            raise ValueError(f"order: expected one of {', '.join(map(repr, ORDERS))}, got {self.order!r}")
         chosen = [name for name in ("hypernetwork", "autoencoder", "initialisation") if getattr(self, name) is not None]
         if len(chosen) > 1:
             raise ValueError(f"model: expected at most one way to find weights, got {' and '.join(chosen)}")

@@ -36,7 +36,7 @@ class Preset:
         training: the procedure.
         resolution: pixels a side of the images it is meant for.
         about: one line for the list of presets.
-        initialisation: how initialisations are learned at this scale; its method does not count.
+        initialisation: how initialisations are learned at this scale; its `method` is ignored.
         outer_rate: of Adam on an initialisation.
         autoencoder: the shape of the autoencoder at this scale.
     """

@@ -21,8 +21,9 @@ from hyperplanes.configuration.presets import Preset
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.fields import find_targets
 from hyperplanes.hypernetwork import KINDS
+from hyperplanes.utilities.arguments import kind_of
 from hyperplanes.utilities.errors import nearest
-from hyperplanes.utilities.files import DataError, read_bytes
+from hyperplanes.utilities.files import MALFORMED, DataError, read_bytes
 from hyperplanes.utilities.settings import SettingsError, structure
 from hyperplanes.utilities.writing import write_whole
 
@@ -33,12 +34,20 @@ LARGEST = 2**20  # bytes of a file
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain values only; 1e-3 is a number, as in YAML 1.2, and nothing stands for another part of the file."""
+    """Plain values only, without aliases and repeated keys; 1e-3 is a number, as in YAML 1.2."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("an alias (*name), which is not supported")
         return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        made = super().construct_mapping(node, deep)
+        names = [name.value for name, _ in node.value]
+        repeated = [name for place, name in enumerate(names) if name in names[:place]]
+        if repeated:
+            raise yaml.YAMLError(f"the entry {repeated[0]!r} more than once")
+        return made
 
 
 _Loader.add_implicit_resolver(
@@ -67,7 +76,7 @@ def read_experiment(path: Path) -> dict[str, Any]:
         raise DataError(path, "a YAML file of settings", error.strerror or str(error), "check the path") from None
     try:
         value = yaml.load(text, _Loader)  # noqa: S506 - a subclass of SafeLoader
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, *MALFORMED) as error:
         raise DataError(path, "YAML", str(error) or type(error).__name__, remedy) from None
     if not isinstance(value, dict):
         raise DataError(path, "a mapping of settings", f"a {type(value).__name__}", remedy)
@@ -179,10 +188,9 @@ def parse_options(given: Sequence[str]) -> dict[str, Any]:
                 raise SettingsError(option, "given beside the whole of which it is a part; leave one of them out")
         try:
             read = [yaml.load(value, _Loader) for value in values]  # noqa: S506 - a subclass of SafeLoader
-        except (yaml.YAMLError, ValueError) as error:
-            raise SettingsError(
-                option, f"expected a plain value, got {values} ({' '.join(str(error).split())})"
-            ) from None
+        except (yaml.YAMLError, *MALFORMED) as error:
+            found, problem = kind_of(" ".join(values)), " ".join(str(error).split())
+            raise SettingsError(option, f"expected a plain value, got {found} ({problem})") from None
         if isinstance(node.get(names[-1]), dict):
             raise SettingsError(option, "given beside a part of it; leave one of them out")
         node[names[-1]] = True if not read else read[0] if len(read) == 1 else read

@@ -1,6 +1,6 @@
 """Target networks: (x, d; parameters) -> (colour, density).
 
-Another package adds one by an entry point of the group `hyperplanes.fields` that names a subclass of `Target`.
+Another package adds one with an entry point of the group `hyperplanes.fields` that names a subclass of `Target`.
 """
 
 from hyperplanes.fields.base import Field, Target, TargetConfig
@@ -34,5 +34,5 @@ TARGETS: dict[str, type[Target]] = {
 
 
 def find_targets() -> dict[str, type[Target]]:
-    """All fields by name: those of this package, then those of the other packages that are installed."""
+    """All fields by name: those of this package, then those of other installed packages."""
     return TARGETS | load_entries("hyperplanes.fields", TARGETS)

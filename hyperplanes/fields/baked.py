@@ -17,9 +17,9 @@ __all__ = ["HARMONICS", "LARGEST_SIDE", "BakedField", "spherical_harmonics"]
 
 HARMONICS = 9
 LARGEST_SIDE = 512
-STORED = {  # what a file holds
+STORED = {  # dtypes of the tensors in a file
     "occupied": torch.uint8,
-    "scaled_density": torch.float16,  # times the radius: half precision whatever the unit of the world
+    "scaled_density": torch.float16,  # times the radius, so that the range does not depend on the world unit
     "coefficients": torch.uint8,
     "range": torch.float32,
     "sphere": torch.float32,
@@ -54,7 +54,7 @@ class BakedField:
     """A sparse voxel grid: one row of numbers at the centre of every visible voxel.
 
     Attributes:
-        index: row of every voxel of the cube around the bounds, -1 where there is none; indexed [x, y, z].
+        index: row of each voxel of the cube around the bounds, or -1; indexed [x, y, z].
         values: density per world unit, then 3 x 9 coefficients of colour, red first.
         bounds: the sphere of the scene.
     """
@@ -70,7 +70,7 @@ class BakedField:
 
     @property
     def occupancy(self) -> Occupancy:
-        """Where interpolation may find a row: the voxels that have one and their neighbours."""
+        """Where interpolation reads a row: the voxels that have one and their neighbours."""
         return Occupancy(self.index >= 0, self.bounds).dilated()
 
     def centres(self) -> Float[Tensor, "row 3"]:
@@ -81,13 +81,12 @@ class BakedField:
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
-        """Colour and density: trilinear between voxel centres, density zero where a voxel has no row.
+        """Colour and density, interpolated trilinearly between voxel centres; voxels without a row have density 0.
 
-        Colour is interpolated over the corners that have one, weighted by their density, so that it does not fade
-        towards empty voxels.
+        Colours are weighted by density, so that they do not fade towards empty voxels.
         """
         side = self.side
-        # the eight voxels around each point, and the share of each
+        # the eight voxels around each point, and their weights
         place = (self.bounds.normalise(points) + 1) * (side / 2) - 0.5
         low = place.floor()
         fraction = place - low
@@ -106,15 +105,15 @@ class BakedField:
             weighted = weight * found[:, 0]
             density = density + weighted
             coefficients = coefficients + weighted[:, None] * found[:, 1:]
-        # colour: the mean of the coefficients by density, along the directions
+        # colour: the mean of the coefficients weighted by density, along the directions
         coefficients = (coefficients / density.clamp_min(1e-8 / self.bounds.radius)[:, None]).reshape(-1, 3, HARMONICS)
         colour = (coefficients * spherical_harmonics(directions)[:, None]).sum(-1)
         return colour.clamp(0, 1), density
 
     def save(self, path: Path | str) -> None:
-        """Write one compact file: a bit a voxel, and a row of half precision density and a byte a coefficient.
+        """Write one compact file: a bit per voxel, and for each row a float16 density and a byte per coefficient.
 
-        Bytes divide the range of each coefficient, so that pictures change by less than a grey level of 255.
+        Bytes divide the range of each coefficient, so pictures change by less than one of 255 grey levels.
 
         Raises:
             ValueError: an odd number of voxels an axis.
@@ -138,7 +137,7 @@ class BakedField:
         """The field that `save` wrote.
 
         Raises:
-            CheckpointError: a missing or damaged file, or one that holds something else.
+            CheckpointError: a missing or damaged file, or one with other content.
         """
         path = Path(path)
         found = load_tensors(path)

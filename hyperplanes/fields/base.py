@@ -1,7 +1,8 @@
-"""What every target network has in common: an MLP of explicit parameters, bound to planes as a field."""
+"""The base classes of target networks: an MLP with explicit parameters, bound to planes as a field."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -35,12 +36,12 @@ class TargetConfig:
     Attributes:
         depth: fully connected layers before the heads.
         width: of each of them; the layer before colours has half of it.
-        planes: number of ImagePlanes the network is made for; of a field that takes any number of views, those
-            that are read at a point.
+        planes: number of ImagePlanes of the network; for a field that takes any number of views, the number that is
+            read at a point.
         point_frequencies: number of frequencies of the positional encoding of points.
         direction_frequencies: number of frequencies of the positional encoding of viewing directions.
-        density_scale: what the density head is multiplied with; an object of unit radius is a few voxels deep, so
-            densities of tens are the rule.
+        density_scale: factor of the density head; an object of unit radius is a few voxels deep, so typical densities
+            are in the tens.
     """
 
     depth: Annotated[int, range(1, 257)] = 8
@@ -50,21 +51,24 @@ class TargetConfig:
     direction_frequencies: Annotated[int, range(33)] = 4
     density_scale: float = 25.0
 
+    def __post_init__(self) -> None:
+        if not 0 < self.density_scale < math.inf:
+            raise ValueError(f"density_scale: expected more than 0 and finite, got {self.density_scale}")
+
 
 class Target(nn.Module):
     """F(x, z, d; theta) = (c, sigma): colour depends on the direction, density does not.
 
-    The module holds theta; `bind` evaluates the network with any parameters of the same names and shapes, and with what
-    `finer` makes of them. Subclasses say what the first layer reads, and where they treat support views otherwise than
-    the paper's fields do.
+    The module holds theta; `bind` makes a field of any parameters with the same names and shapes, or of those that
+    `finer` returns. Subclasses define the input of the first layer, and override what differs from the paper's fields.
 
     Attributes:
-        config_type: the dataclass of its shape.
-        permutation_invariant: takes any number of views in any order, and so could copy the view that a ray comes from;
-            otherwise `config.planes` views, each known by its place.
-        reads_planes: looks something up in support views; otherwise, where nothing else reads them by their places, all
-            of them are taken as they are.
-        volume_size: channels and cells an axis of what `volume_of` makes; None where there is no such volume.
+        config_type: the dataclass of its configuration.
+        permutation_invariant: whether it takes any number of views in any order, and so could copy the view that a ray
+            comes from; otherwise it takes `config.planes` views, each at a fixed position in its input.
+        reads_planes: whether it looks something up in support views. If not, and no hypernetwork reads them, all views
+            are taken as they are.
+        volume_size: channels and cells an axis of the result of `volume_of`; None if there is no such volume.
     """
 
     config_type: ClassVar[type[TargetConfig]] = TargetConfig
@@ -93,38 +97,38 @@ class Target(nn.Module):
 
     @property
     def reading_layers(self) -> tuple[str, ...]:
-        """The names of the layers that read a point: the first one and that of the skip connection."""
+        """The names of the layers that read the inputs: the first one and that of the skip connection."""
         return ("layers.0",) if self.skip == 0 else ("layers.0", f"layers.{self.skip}")
 
     @property
     def input_size(self) -> int:
-        """How many numbers the first layer reads of a point."""
+        """Number of inputs of the first layer."""
         raise TypeError(f"{type(self).__name__} does not say what it reads")
 
     def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:
-        """What the first layer reads of world points, (point, input_size)."""
+        """The inputs of the first layer for world points, (point, input_size)."""
         raise TypeError(f"{type(self).__name__} does not say what it reads")
 
     @property
     def rig_size(self) -> int:
-        """How many planes stand in a rig; 0 for a network that knows none by its place."""
+        """Number of planes in the rig; 0 for a network that takes any number of views."""
         return 0 if self.permutation_invariant else self.config.planes
 
     @property
     def fine_tuning_rates(self) -> Mapping[str, float]:
-        """Learning rates that suit the weights better than those of all fields, by the names of `FineTuning`."""
+        """Learning rates that suit this field better than the default ones, by their names in `FineTuning`."""
         return {}
 
     def arrange(self, support: Views, rig: Rig) -> Views:
-        """The support views as planes: here one a plane, each the nearest to where the rig has one, if it has any."""
+        """The support views as planes: by default the nearest view for each plane of the rig, or all without a rig."""
         return support[rig.places(support)] if len(rig) else support
 
     def choose_hyperplanes(self, views: Views, rig: Rig, count: int, choice: str) -> Int[Tensor, " k"]:
-        """Which of the arranged views a hypernetwork reads.
+        """The indices of the arranged views that a hypernetwork reads.
 
         Args:
             views: as `arrange` returned them.
-            rig: where they stand.
+            rig: of the views.
             count: k.
             choice: the "farthest" apart, or the "first".
         """
@@ -133,58 +137,58 @@ class Target(nn.Module):
         return rig.farthest(count).to(views.images.device)
 
     def hull_resolution(self, configured: int, support: Views) -> int:
-        """Voxels an axis of the visual hull of some views; here what the model is configured with."""
+        """Voxels an axis of the visual hull of some views; by default the configured number."""
         return configured
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> Any:
-        """What `bind` reads of support views and their visual hull; here the ImagePlanes alone."""
+        """The input of `bind` from support views and their visual hull; by default the ImagePlanes alone."""
         return ImagePlanes(views.images, views.cameras)
 
     def volume_of(self, planes: Any) -> Float[Tensor, "channel x y z"] | None:
-        """What the planes show on a grid over the scene, for a hypernetwork that reads it; here nothing."""
+        """The planes resampled on a grid over the scene, for a hypernetwork that reads it; by default None."""
         return None
 
     def with_surface(self, planes: Any, voxels: Occupancy) -> Any:
-        """The planes with the surface of the voxels that a field fills; here as they are.
+        """The planes, with visibility by the surface of the voxels that a field fills; by default unchanged.
 
         Args:
             planes: of `planes_of`.
-            voxels: within the visual hull.
+            voxels: inside the visual hull.
         """
         return planes
 
     def bind(self, parameters: Parameters, planes: Any, bounds: Sphere | None = None) -> Field:
-        """The field that these parameters and planes make.
+        """The field of these parameters and planes.
 
         Args:
             parameters: theta or theta + delta.
-            planes: the support images, as `planes_of` made them; None for a network that reads none.
-            bounds: the sphere of the scene, which the network sees as the unit sphere.
+            planes: of `planes_of`; None for a network that reads no image.
+            bounds: the sphere of the scene, which is normalised to the unit sphere.
 
         Returns:
             A callable (points, directions) -> (colour, density).
 
         Raises:
-            ValueError: another number of planes than the network was made for.
+            ValueError: a number of planes other than `config.planes`.
         """
         if planes is not None and len(planes) != self.config.planes:
             raise ValueError(f"planes: expected {self.config.planes}, got {len(planes)}")
         return MLPField(self, parameters, planes, bounds or Sphere())
 
     def finer(self, parameters: Parameters, cells: int) -> Parameters:
-        """Nearly the same field by weights that have room for more detail; here as they are.
+        """Parameters of nearly the same field with more capacity for detail; by default unchanged.
 
         Args:
             parameters: theta or theta + delta.
-            cells: an axis of a grid of features, where there is one.
+            cells: an axis of a grid of features, if there is one.
         """
         return parameters
 
     def config_of(self, parameters: Parameters) -> TargetConfig:
-        """The shape of the network that these parameters are of: this one, but for what `finer` changes.
+        """The configuration for these parameters: that of this network, except for what `finer` changes.
 
         Args:
-            parameters: that `bind` takes.
+            parameters: as `bind` takes them.
         """
         return self.config
 
@@ -192,7 +196,7 @@ class Target(nn.Module):
         """The parameters that a field of this network was bound with.
 
         Raises:
-            ValueError: a field that is no network.
+            ValueError: a field that is not a network.
         """
         if not isinstance(field, Field):
             raise ValueError(f"adapted: expected a field that HyperPlanes made, got {type(field).__name__}")
@@ -201,15 +205,15 @@ class Target(nn.Module):
 
 @dataclass(frozen=True)
 class Field:
-    """A target network with its parameters and planes: what the renderer calls.
+    """A target network with its parameters and planes, as the renderer calls it.
 
     Attributes:
         target: the network.
         parameters: its weights for this object.
-        planes: the support images of this object, as `Target.planes_of` made them.
+        planes: of `Target.planes_of` for this object.
         bounds: the sphere of the scene.
-        mixed_precision: the layers before the heads may multiply numbers of bfloat16, where no gradient is wanted and
-            that is faster; by default they are of single precision.
+        mixed_precision: whether the layers before the heads may multiply in bfloat16 where that is faster and no
+            gradient is needed.
     """
 
     target: Target
@@ -218,7 +222,7 @@ class Field:
     bounds: Sphere
     mixed_precision: bool = False
 
-    thread_safe: ClassVar[bool] = True  # nothing changes while it is evaluated: several threads share a picture
+    thread_safe: ClassVar[bool] = True  # evaluation has no side effects, so threads can share a picture
 
     def __repr__(self) -> str:
         weights = sum(value.numel() for value in self.parameters.values())
@@ -227,7 +231,7 @@ class Field:
 
     @cached_property
     def in_mixed_precision(self) -> Self:
-        """The same field, whose layers may multiply numbers of bfloat16; itself where that is no faster."""
+        """The same field, with layers that may multiply in bfloat16; itself if that is not faster."""
         return replace(self, mixed_precision=True) if has_mixed_precision() and not self.mixed_precision else self
 
     @property
@@ -242,7 +246,7 @@ class Field:
         raise TypeError(f"{type(self).__name__} does not say what it computes")
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per world unit alone."""
+        """Density per world unit, without colour."""
         raise TypeError(f"{type(self).__name__} does not say what it computes")
 
     def trunk(self, inputs: Float[Tensor, "point input"]) -> Float[Tensor, "point width"]:
@@ -256,7 +260,7 @@ class Field:
                 return packed(inputs)
         value = inputs
         for index, (weight, bias) in enumerate(layers):
-            if index == self.target.skip > 0:  # of inputs and values side by side, without putting them there
+            if index == self.target.skip > 0:  # of inputs and values concatenated, without copying them
                 size = inputs.shape[-1]
                 value = torch.addmm(linear(inputs, weight[:, :size], bias), value, weight[:, size:].T)
             else:
@@ -265,7 +269,7 @@ class Field:
         return value
 
     def _packed(self, layers: Sequence[Layer]) -> PackedLayers | None:
-        """The layers for the kernel: packed once, and anew where weights have changed in place."""
+        """The layers for the kernel, packed once, and again if weights have changed in place."""
         values = [value for layer in layers for value in layer]
         return kept(
             self,
@@ -275,18 +279,18 @@ class Field:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is computed from the rest: for copies and pickles."""
+        """The attributes without cached values, for copies and pickles."""
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def viewed(self, hidden: Float[Tensor, "point width"], seen: Float[Tensor, "point number"]) -> Tensor:
-        """The layer "view" of the layer "feature" and what depends on the direction, side by side; before its ReLU."""
+        """Output of the layer "view", before ReLU, for the concatenation of "feature" and the direction's inputs."""
         weight, bias, of_view = self._view_of_hidden()
         return torch.addmm(linear(seen, of_view, bias), hidden, weight.T)
 
     def _view_of_hidden(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Weights and biases of "feature" and "view" as one layer, since nothing lies between them; those of the rest.
+        """Weight and bias of "feature" and "view" merged (nothing lies between them), and the weight for the rest.
 
-        W [F h + f, d] + b = (W_h F) h + W_d d + (W_h f + b): of `small` two fifths of the products.
+        W [F h + f, d] + b = (W_h F) h + W_d d + (W_h f + b): two fifths of the multiplications for `small`.
         """
         view, width = self.parameters["view.weight"], self.target.config.width
         own, of_view = view[:, :width], view[:, width:]
@@ -310,31 +314,31 @@ class MLPField(Field):
         return self.colour_of(hidden, directions), self.density_of(hidden)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per world unit alone."""
+        """Density per world unit, without colour."""
         return self.density_of(self.hidden(points))
 
     def hidden(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:
-        """What the heads read; all that is expensive about a point."""
+        """The input of the heads, which is the expensive part of a point."""
         return self.trunk(self.target.inputs(points, self.planes, self.bounds))
 
     def density_of(self, hidden: Float[Tensor, "point width"]) -> Float[Tensor, " point"]:
-        """The opacity head. Softplus, not NeRF's ReLU: it cannot die, and a hypernetwork moves its bias."""
+        """The density head, with softplus instead of NeRF's ReLU, which could die as a hypernetwork moves its bias."""
         raw = self.layer("density", hidden)[:, 0]
-        # per radius of the scene, so that a larger scene is no denser
+        # per radius of the scene, so that a larger scene is not denser
         return softplus(raw) * (self.target.config.density_scale / self.bounds.radius)
 
     def colour_of(
         self, hidden: Float[Tensor, "point width"], directions: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point 3"]:
         """The colour head."""
-        # the viewing direction joins the features of the point, in a layer of half the width
+        # the viewing direction is concatenated with the features of the point, for a layer of half the width
         seen = encode(directions, self.target.config.direction_frequencies)
         return torch.sigmoid(self.layer("colour", relu(self.viewed(hidden, seen), inplace=True)))
 
     def colours_along(
         self, hidden: Float[Tensor, "point width"], directions: Float[Tensor, "direction 3"]
     ) -> Float[Tensor, "point direction 3"]:
-        """The colour head for every point in every direction; what does not depend on both is computed once."""
+        """The colour head for all pairs of points and directions; what depends on one of them is computed once."""
         weight, bias, of_view = self._view_of_hidden()
         # W [h, d] + b = (W_h h + b) + W_d d: one product a point, one a direction
         here, along = linear(hidden, weight, bias), encode(directions, self.target.config.direction_frequencies)

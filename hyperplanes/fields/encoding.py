@@ -11,21 +11,21 @@ from hyperplanes.geometry.chosen_views import OCTAVES
 __all__ = ["encoded_size", "encode"]
 
 
-def encoded_size(frequencies: int, size: int = 3) -> int:
-    """Length of an encoded vector."""
-    return size * (1 + 2 * frequencies)
+def encoded_size(frequencies: int) -> int:
+    """Length of an encoded point or direction."""
+    return 3 * (1 + 2 * frequencies)
 
 
 def encode(values: Float[Tensor, "*vectors"], frequencies: int, dim: int = -1) -> Float[Tensor, "*encoded"]:
     """(v, sin(2^0 v), ..., sin(2^(L-1) v), cos(2^0 v), ..., cos(2^(L-1) v)) (NeRF, Eq. 4, without its factor pi).
 
-    Of every OCTAVES octaves the first sine and cosine are computed; the others follow by doubling the angle, which
-    multiplies their errors, too. Halves are computed in single precision.
+    Only the first sine and cosine of every OCTAVES octaves are computed; the others follow by angle doubling, which
+    also multiplies errors. Half precision is computed in single precision.
 
     Args:
-        values: coordinates within about [-1, 1].
+        values: coordinates in about [-1, 1].
         frequencies: L.
-        dim: along which a vector lies, and its encoding.
+        dim: the dimension of vectors and of their encodings.
 
     >>> encode(torch.tensor([0.0, 0.0, 0.0]), 1).tolist()
     [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]

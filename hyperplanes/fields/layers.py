@@ -1,4 +1,4 @@
-"""The layers before the heads of a network by one kernel, where no gradient is wanted."""
+"""The layers before the heads of a network in one kernel, for evaluation without gradients."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ __all__ = ["Layer", "PackedLayers", "has_mixed_precision"]
 Layer = tuple[Tensor, Tensor]
 """Weights (width, input) and biases (width,)."""
 
-POINTS = 480  # that one call of a kernel works on: eight blocks of those for AVX-512, three of that for AMX
+POINTS = 480  # in one call of a kernel: eight blocks of the kernels for AVX-512, three of that for AMX
 
 
 def has_mixed_precision() -> bool:
-    """Whether another kernel multiplies layers in mixed precision than in single precision on this processor."""
+    """Whether this processor has a separate kernel for mixed precision."""
     return layers_module(mixed_precision=True) != layers_module()
 
 
 @dataclass(frozen=True)
 class PackedLayers:
-    """Fully connected layers with ReLU, of which one reads the inputs once more, as the kernel reads them.
+    """Fully connected layers with ReLU and one skip connection from the inputs, packed for the kernel.
 
-    Four layers of 128 values take 0.67 to 0.83 of the time of PyTorch's by AVX-512 and 0.36 to 0.50 by AMX, with 64 to
-    4,096 points (one thread of an Intel processor), and 0.64 to 0.77 by AVX-512 and 0.37 to 0.45 by its instructions
-    for bfloat16 on a Zen 4. The kernels do not hold the interpreter's lock. By AMX, values differ from those of PyTorch
-    by some 1e-5 to 3e-5 of the largest, in mixed precision by 0.1 to 1 %. What is packed is for this process: it cannot
+    Four layers of 128 values take 0.67 to 0.83 of the time of PyTorch with AVX-512 and 0.36 to 0.50 with AMX, for 64 to
+    4,096 points (one thread of an Intel processor), and 0.64 to 0.77 with AVX-512 and 0.37 to 0.45 with its bfloat16
+    instructions on a Zen 4. The kernels release the GIL. With AMX, values differ from those of PyTorch by about 1e-5 to
+    3e-5 of the largest, in mixed precision by 0.1 to 1 %. The packed layers are valid in this process only and cannot
     be pickled.
 
     Attributes:
         module: of the kernel (`layers_module`).
-        weights: of all layers, as its `pack_weights` makes them.
+        weights: of all layers, from its `pack_weights`.
         biases: of all layers.
-        shape: the number of layers, their width, and the index of the layer that reads the inputs, too; 0 for none.
-        inputs: how many numbers the first layer reads.
+        shape: the number of layers, their width, and the index of the layer with the skip connection; 0 for none.
+        inputs: size of the inputs.
     """
 
     module: str
@@ -53,17 +53,16 @@ class PackedLayers:
 
     @classmethod
     def of(cls, layers: Sequence[Layer], skip: int, *, mixed_precision: bool = False) -> PackedLayers | None:
-        """Those of a network.
+        """Packs the layers of a network.
 
         Args:
-            layers: in their order.
-            skip: index of the layer that reads the inputs and the values of the layer before; 0 for none.
-            mixed_precision: the factors of products may be rounded to bfloat16, where that is faster.
+            layers: in order.
+            skip: index of the layer that reads the inputs and the output of the layer before; 0 for none.
+            mixed_precision: whether factors of products may be rounded to bfloat16 where that is faster.
 
         Returns:
-            None where no kernel is faster or takes them: without numba, or AVX-512 or AMX, on other devices, in
-            other precisions, with widths above its widest or no multiple of its columns, and with shapes that do not go
-            together.
+            None if no kernel is faster or supports them: without numba, AVX-512 and AMX, on other devices, in other
+            precisions, for widths above its largest or not a multiple of its columns, and for inconsistent shapes.
         """
         kinds = {(value.device.type, value.dtype) for layer in layers for value in layer}
         module = layers_module(mixed_precision=mixed_precision)
@@ -81,13 +80,13 @@ class PackedLayers:
         return cls(module, torch.cat(packed), biases, (len(layers), width, skip), inputs)
 
     def __reduce__(self) -> NoReturn:
-        raise TypeError("packed layers: expected to be packed anew in each process, which may have another kernel")
+        raise TypeError("packed layers: expected to be packed again in each process, which may have another kernel")
 
     def takes(self, inputs: Tensor) -> bool:
-        """Whether the kernel takes these inputs: of single precision, on the CPU, and as many as the first layer reads.
+        """Whether the kernel takes these inputs: float32, on the CPU, and of the size that the first layer reads.
 
         Args:
-            inputs: one row a point.
+            inputs: one row per point.
         """
         fits = inputs.ndim == 2 and inputs.shape[1] == self.inputs
         return fits and inputs.dtype == torch.float32 and inputs.device.type == "cpu"

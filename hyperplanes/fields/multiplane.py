@@ -17,15 +17,14 @@ __all__ = ["MultiPlaneNeRF", "PointMultiPlaneNeRF"]
 def plane_features(points: Float[Tensor, "point 3"], planes: ImagePlanes) -> list[Float[Tensor, "number point"]]:
     """z(x, I): the colours of a point on all planes, and its coordinates there, 5 n numbers, all in [-1, 1].
 
-    A row holds one number of all points, as the lookup writes it: to put the numbers of each point side by side would
-    take as long as the lookup. Where a point is not seen, the lookup's background colour and clamped coordinate stand;
-    a hidden plane is zeros.
+    Each row has one number of all points, as the lookup writes it: transposing it would take as long as the lookup. For
+    a plane that does not see a point, these are the background colour and clamped coordinates; a masked plane gives 0.
     """
     found = planes.lookup(points)
     colours, coordinates = found.colours.permute(1, 2, 0), found.coordinates.permute(1, 2, 0)
     # colours from [0, 1] to [-1, 1], as coordinates are
     colours = 2 * colours - 1
-    # what a masked plane shows is left out
+    # masked planes give 0
     if planes.masked is not None:
         shown = ~planes.masked[:, None, None]
         colours, coordinates = colours * shown, coordinates * shown
@@ -37,7 +36,7 @@ class MultiPlaneNeRF(Target):
 
     @property
     def input_size(self) -> int:
-        """Three colours and two coordinates a plane."""
+        """Three colours and two coordinates per plane."""
         return 5 * self.config.planes
 
     def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:

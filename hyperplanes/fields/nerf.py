@@ -1,4 +1,4 @@
-"""NeRF: a field of the point and the direction alone (HyperPlanes, Eq. 1)."""
+"""NeRF: a field that reads only the point and the direction (HyperPlanes, Eq. 1)."""
 
 from __future__ import annotations
 
@@ -32,4 +32,4 @@ class NeRF(Target):
         return encode(bounds.normalise(points), self.config.point_frequencies)
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> None:
-        """Nothing: the network reads no image."""
+        """None: the network reads no image."""

@@ -1,4 +1,4 @@
-"""The rig: where the support views stood in training, for fields that know each of their planes by its place."""
+"""The rig: camera directions of the support views in training, for fields with a fixed position for each plane."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ class Rig:
     """Camera directions of the planes, and which support view becomes which plane.
 
     Attributes:
-        positions: unit vectors from the scene's centre to where the cameras stood in training; zeros where no views
-            have been shown yet.
-        order: "matched" gives each plane the view nearest to its direction; "file" takes the views as they come, again
-            from the first where there are too few.
+        positions: unit vectors from the scene's centre to the cameras in training; zeros if not set yet.
+        order: "matched" gives each plane the view nearest to its direction; "file" takes the views in order, repeated
+            from the first if there are too few.
     """
 
     positions: Float[Tensor, "plane 3"]
@@ -34,10 +33,10 @@ class Rig:
 
     @property
     def known(self) -> Float[Tensor, "plane 3"]:
-        """The camera directions on the CPU, where views are matched to them.
+        """The camera directions on the CPU, for matching.
 
         Raises:
-            ValueError: no views have been shown yet.
+            ValueError: they are not set yet.
         """
         positions = self.positions.float().cpu()
         if not positions.any():
@@ -55,7 +54,7 @@ class Rig:
         return chosen.to(support.images.device)
 
     def repeated(self, support: Views) -> Int[Tensor, " repeated"]:
-        """The planes whose view stands at another plane too, where it fits better; those to be masked."""
+        """The planes whose view is also at a better fitting plane; these are to be masked."""
         places = self.places(support)
         near = torch.zeros(len(self))
         if self.order != "file":
@@ -63,15 +62,15 @@ class Rig:
         return repeated_planes(places, near)
 
     def farthest(self, count: int) -> Int[Tensor, " k"]:
-        """So many planes that stand as far apart as they can, the first one among them."""
+        """The indices of `count` planes that are as far apart as possible, including the first."""
         return torch.tensor(farthest_first(self.known, 0, count), dtype=torch.long, device=self.positions.device)
 
 
 def match(rig: Float[Tensor, "plane 3"], standing: Float[Tensor, "view 3"]) -> Int[Tensor, " plane"]:
-    """The view of each plane: together as near as can be to where the views of the training stood.
+    """The view of each plane, assigned with the least total distance to the directions in training.
 
-    More views than planes: none stands at two. Fewer: each stands at as many at most as it takes to fill all planes,
-    and one that is far from all of them may stand at none.
+    With more views than planes, no view is used twice. With fewer, each is used at most as often as it takes to fill
+    all planes, and one that is far from all of them may not be used.
 
     Args:
         rig: camera directions of the planes in training, on the CPU.
@@ -86,14 +85,14 @@ def match(rig: Float[Tensor, "plane 3"], standing: Float[Tensor, "view 3"]) -> I
 
 
 def repeated_planes(places: Int[Tensor, " plane"], near: Float[Tensor, " plane"]) -> Int[Tensor, " repeated"]:
-    """The planes whose view stands at another one too: each view keeps its nearest plane, of equal ones the first.
+    """The planes whose view is also at another plane: each view keeps its nearest plane, of equal ones the first.
 
     >>> repeated_planes(torch.tensor([0, 1, 0, 1]), torch.tensor([0.5, 1.0, 0.9, 1.0])).tolist()
     [0, 3]
 
     Args:
         places: the view of each plane.
-        near: how near each plane's view stands to where that of the training stood.
+        near: how near each plane's view is to the direction in training; larger is nearer.
     """
     kept = {int(places[plane]): plane for plane in near.argsort(descending=True, stable=True).flip(0).tolist()}
     return torch.tensor(sorted(set(range(len(places))) - set(kept.values())), dtype=torch.long)

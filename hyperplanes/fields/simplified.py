@@ -1,4 +1,4 @@
-"""The simplified NeRF of Tancik et al. 2021: a field of the point alone, one MLP without directions."""
+"""The simplified NeRF of Tancik et al. 2021: one MLP that reads only the point, not the direction."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ HIGHEST = 8.0  # binary logarithm of the highest frequency
 
 
 class SimplifiedNeRF(NeRF):
-    """F(x; theta) = (c, sigma), as tancik/learnit has it for ShapeNet (Experiments/shapenet.ipynb).
+    """F(x; theta) = (c, sigma), as in tancik/learnit for ShapeNet (Experiments/shapenet.ipynb).
 
     Sines and cosines of the point at `point_frequencies` frequencies from 1 to 256, `depth` layers without a skip
-    connection, and one layer for colour and density, of which ReLU is taken. `direction_frequencies` and
-    `density_scale` are not read.
+    connection, and one layer for colour and density, with ReLU for density. `direction_frequencies` and `density_scale`
+    are not used.
 
     Raises:
-        ValueError: no frequency, so that nothing of the point would be read.
+        ValueError: no frequency, so that the point would not be read.
     """
 
     def __init__(self, config: TargetConfig) -> None:
-        if config.point_frequencies < 1:  # the point itself is no input
+        if config.point_frequencies < 1:  # the point itself is not an input
             raise ValueError("network.point_frequencies: expected at least 1 for simplified_nerf, got 0")
         super().__init__(config)
         width = config.width
@@ -47,18 +47,18 @@ class SimplifiedNeRF(NeRF):
 
     @property
     def input_size(self) -> int:
-        """A sine and a cosine of three coordinates a frequency."""
+        """A sine and a cosine of three coordinates per frequency."""
         return 6 * self.config.point_frequencies
 
     def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:
-        """The encoded position in world units, seen from the middle of the scene."""
+        """The encoded position in world units, relative to the centre of the scene."""
         count = self.config.point_frequencies
         frequencies = 2 ** torch.linspace(0, HIGHEST, count, dtype=points.dtype, device=points.device)
         angles = ((points - points.new_tensor(bounds.centre))[:, None] * frequencies[:, None]).flatten(1)
         return torch.cat([angles.sin(), angles.cos()], 1)
 
     def bind(self, parameters: Parameters, planes: ImagePlanes | None, bounds: Sphere | None = None) -> MLPField:
-        """The field that these parameters make."""
+        """The field of these parameters."""
         return SimplifiedField(self, parameters, planes, bounds or Sphere())
 
 

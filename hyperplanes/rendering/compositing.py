@@ -37,7 +37,9 @@ class Rendered:
         return replace(self, colour=colour, coarse=self.coarse and self.coarse.over(background))
 
     def pooled(self, count: int) -> Rendered:
-        """The pixels of which each has so many rays, all first ones of the pixels first; the depth is that of these.
+        """Averages `count` rays a pixel, ordered with the first ray of every pixel first, then every second ray.
+
+        Depth is that of the first rays.
 
         Args:
             count: rays of a pixel.

@@ -21,15 +21,15 @@ from hyperplanes.utilities.memory import require_memory
 __all__ = ["EDGE_SUBPIXELS", "Pictures", "join_pictures", "pixels_at_edges", "render_images"]
 
 BYTES_OF_VIEW, BYTES_KEPT = 200, 32
-"""That a pixel takes: of rays, while its view is rendered, and of the pictures of all views."""
+"""Bytes a pixel takes: for the rays of the view being rendered, and for the finished pictures of all views."""
 
 RAYS_OF_GROUP = 1 << 14
 """Rays that small views are rendered together up to: by two threads 25 views of 64x64 take 0.94 s so, and 1.78 one by
 one (`small`, idle)."""
 
 EDGE = 0.7
-"""Difference of a pixel to a neighbour, in colour or opacity, from which on further rays are cast through it; from 0.35
-on it brings next to nothing, with 0.9 half as much."""
+"""Difference between neighbouring pixels, in colour or opacity, from which on more rays are cast through both. Lowering
+it to 0.35 gains next to nothing more; 0.9 gains half as much."""
 
 EDGE_SUBPIXELS = ((0.0, 0.0), (-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 """Places in such a pixel, from its centre: that and a rotated grid of four."""

@@ -33,7 +33,7 @@ class DenseSamples:
 
 @dataclass(frozen=True)
 class PackedSamples:
-    """Samples of many rays in one row each, ray after ray, in the order of distance.
+    """Samples of many rays, one row a sample, ray after ray, in the order of distance.
 
     Attributes:
         ray: index of the ray of each sample, ascending.

@@ -15,6 +15,7 @@ from torch.nn.functional import pad
 from hyperplanes.geometry.kernels import voxel_rays
 from hyperplanes.geometry.kernels.compiling import compile_function
 from hyperplanes.geometry.kernels.threads import parallel_for
+from hyperplanes.geometry.occupancy import ranges
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered
 
@@ -51,12 +52,7 @@ class VoxelGrid:
             index: row of every voxel of a cube, or -1.
             bounds: the sphere inside the cube.
         """
-        low, high = [0, 0, 0], [1, 1, 1]
-        filled = index >= 0
-        if filled.any():
-            along = [filled.flatten(1).any(1), filled.any(2).any(0), filled.flatten(0, 1).any(0)]
-            places = [each.nonzero()[:, 0] for each in along]
-            low, high = [int(each[0]) for each in places], [int(each[-1]) + 1 for each in places]
+        low, high = zip(*((first, last or 1) for first, last in ranges(index >= 0)), strict=True)
         box = index[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
         voxel = 2 * bounds.radius / len(index)
         first = torch.tensor(bounds.centre) - bounds.radius + voxel * (torch.tensor(low) - 0.5)

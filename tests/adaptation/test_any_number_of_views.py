@@ -16,6 +16,7 @@ from hyperplanes.fields import ImageBasedConfig, TargetConfig
 from hyperplanes.geometry.cameras import centres
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
+from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import RayMarching
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.utilities.metrics import psnr
@@ -208,7 +209,7 @@ class Recorder:
         self.eyes, self.notes = centres(support.cameras), []
 
     def descent(self, support, settings, pixels=None):
-        return Descent(self, [self.value], support, settings, pixels, masks_views=True)
+        return Descent(self, [self.value], Parameters, support, settings, pixels, masks_views=True)
 
     def __call__(self, hidden):
         def trace(rays, generator=None):

@@ -10,10 +10,11 @@ from hyperplanes.adaptation import HyperPlanes, descent
 from hyperplanes.adaptation.context import trained_on
 from hyperplanes.adaptation.descent import split_holdout
 from hyperplanes.adaptation.fine_tuned import FromScratch
-from hyperplanes.adaptation.fine_tuning import made_anyway, make_descent
+from hyperplanes.adaptation.fine_tuning import fine_tune_to, made_anyway, make_descent
 from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.stacking import AveragedField
 from hyperplanes.configuration.fine_tuning import AVERAGE, MANY_VIEWS, FineTuning
+from hyperplanes.geometry.reflections import Plane, Symmetry
 from tests.adaptation.test_learned_steps import stepping
 from tests.reference_rendering import ball_views, ring
 
@@ -67,6 +68,13 @@ def test_who_has_no_field_before_the_steps_is_shown_as_they_end():
         FineTuning(average=1.5)
 
 
+def test_reflections_are_not_counted_where_an_average_is_given():
+    adapter, across = stepping(), Symmetry(Plane((1.0, 0.0, 0.0)))
+    context = adapter.prepare(ball_views(ring(MANY_VIEWS - 4)), symmetry=across)
+    assert len(context.views) > MANY_VIEWS
+    assert fine_tune_to(adapter, context, 1, replace(FEW, average=0.3)).share == 0.3
+
+
 @pytest.mark.parametrize("cells", [None, 40])
 def test_the_weights_of_one_object_keep_both_and_further_steps_the_first(cells, tmp_path):
     adapter, support = stepping(), ball_views(ring(3))
@@ -89,7 +97,7 @@ def test_how_many_steps_are_best_is_found_by_means(monkeypatch):
     views = trained_on(context, shown)
     beside = adapter.field(context, updated_weights(adapter, context))
     stops = [
-        make_descent(adapter, context, replace(FEW, max_steps=6), views)[0].best_stop(
+        make_descent(adapter, context, replace(FEW, max_steps=6), views).best_stop(
             holdout, unchanged=beside, beside=beside, share=share
         )
         for share in (0.0, 1.0)

@@ -108,12 +108,6 @@ def test_view_shows_the_object_alone(scene, monkeypatch, tmp_path):
         torch.testing.assert_close(corner, torch.ones_like(corner), atol=0.02, rtol=0)
 
 
-def test_without_a_room_the_sphere_holds_it(scene):
-    views, outlines = scene
-    found = separate_background(views, room=False).cut_out(views)
-    assert overlap(found, outlines) < 0.6
-
-
 def test_too_few_views_are_refused(scene):
     with pytest.raises(ValueError, match="views: expected at least 5 without lens distortion, got 4"):
         separate_background(scene[0][:4])

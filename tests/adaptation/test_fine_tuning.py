@@ -57,7 +57,7 @@ def moved(model, field):
 def test_an_empty_picture_is_judged_by_the_distance_of_the_views_from_white(model):
     grey = ball_views(ring(4))
     grey = replace(grey, images=torch.full_like(grey.images, 0.25))
-    descent, _ = make_descent(model, model.prepare(grey), WEIGHTS)
+    descent = make_descent(model, model.prepare(grey), WEIGHTS)
     assert descent.errors()[1] == 0.75**2
 
 
@@ -117,10 +117,10 @@ def test_many_views_decide_how_the_weights_of_a_field_of_any_number_are_tuned(ta
     settings = FineTuning(trainable, rays=8)
     context = model.prepare(many)
     assert len(context.given) == count
-    found = make_descent(model, context, settings)[0].settings
+    found = make_descent(model, context, settings).settings
     assert (found.draw, found.cells) == (draw, cells)
     for stated in ("uniform", "contrast"):
-        assert make_descent(model, context, replace(settings, draw=stated))[0].settings.draw == stated
+        assert make_descent(model, context, replace(settings, draw=stated)).settings.draw == stated
 
 
 @pytest.mark.parametrize(("cells", "optimised"), [(None, 64), (0, 32), (16, 32), (48, 48)])
@@ -168,9 +168,9 @@ def test_weights_that_are_given_and_hypernetworks_keep_their_cells():
     model = small_model(target="image_based", network=network, hypernetwork=VolumeHyperNetworkConfig())
     views = ball_views(ring(FINE_VIEWS, (12, 12)))
     context = model.prepare(views)
-    descent, variables = make_descent(model, context, FineTuning(cells=48), start=model.theta)
+    descent = make_descent(model, context, FineTuning(cells=48), start=model.theta)
     assert descent.settings.cells == 0
-    assert variables.weights()["fine.grid.weight"].shape[-1] == 32
+    assert descent.weights()["fine.grid.weight"].shape[-1] == 32
     with pytest.raises(ValueError, match="cells: expected None or 0 for a hypernetwork"):
         model.fine_tune(views, 2, FineTuning("hypernetwork", cells=64))
     other = small_model(target="image_based", network=replace(network, width=8), hypernetwork=None)
@@ -376,7 +376,7 @@ def test_auto_tries_what_it_goes_on_with(monkeypatch):
 
     def noting(*given):
         descent = made(*given)
-        decided.append((descent[0].settings.fresh, descent[0].settings.draw, descent[0].settings.cells))
+        decided.append((descent.settings.fresh, descent.settings.draw, descent.settings.cells))
         return descent
 
     monkeypatch.setattr(fine_tuning, "make_descent", noting)
@@ -397,7 +397,7 @@ def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
     blank = AdaptedField(lambda p, d: (torch.ones_like(p), p.new_zeros(len(p))), full(bounds, 4), RayMarching(24))
     best = fine_tuning.fine_tune_to(model, context, 40, WEIGHTS)  # better than a few steps
     stops = [
-        make_descent(model, context, replace(WEIGHTS, max_steps=10), shown)[0].best_stop(holdout, unchanged=unchanged)
+        make_descent(model, context, replace(WEIGHTS, max_steps=10), shown).best_stop(holdout, unchanged=unchanged)
         for unchanged in (blank, best)
     ]
     assert stops[0] > stops[1] == 0
@@ -405,7 +405,7 @@ def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
 
 def test_parts_of_the_rays_of_a_step_have_the_gradients_of_all_whatever_the_threads(model, support, monkeypatch):
     monkeypatch.setattr(descent_module, "PART", 12)
-    descent, _ = make_descent(model, model.prepare(support), WEIGHTS)
+    descent = make_descent(model, model.prepare(support), WEIGHTS)
     field, (rays, truth) = descent.field(None), support.sample_rays(30, generator=torch.Generator().manual_seed(1))
     # one loss of the same rays, each part of which takes its samples from a generator of its own
     seeds = torch.randint(2**62, (3,), generator=torch.Generator().manual_seed(2)).tolist()
@@ -428,7 +428,7 @@ def test_parts_of_the_rays_of_a_step_have_the_gradients_of_all_whatever_the_thre
 
 def test_a_field_that_is_not_thread_safe_is_called_by_one_thread(model, support, monkeypatch):
     monkeypatch.setattr(descent_module, "PART", 16)
-    descent, _ = make_descent(model, model.prepare(support), WEIGHTS)
+    descent = make_descent(model, model.prepare(support), WEIGHTS)
     rays, truth = support.sample_rays(64, generator=torch.Generator().manual_seed(1))
     before, found = torch.get_num_threads(), {True: set(), False: set()}
     try:

@@ -19,6 +19,7 @@ from hyperplanes.adaptation.stacking import (
     CAUTION,
     MARGIN,
     StackedField,
+    average,
     best_share,
     hull_share,
     learned_part,
@@ -34,7 +35,7 @@ from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Sphere, cast
 from hyperplanes.geometry.reflections import Plane, Symmetry
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
-from hyperplanes.rendering import RayMarching, render
+from hyperplanes.rendering import Hierarchical, RayMarching, render
 from hyperplanes.training import TrainingConfig
 from hyperplanes.training.validation import Validator
 from hyperplanes.utilities.metrics import psnr
@@ -152,7 +153,11 @@ def test_a_model_in_double_precision_is_stacked_too():
     one, other = (HullBlend().adapt_to(each.planes).render(cameras) for each in (context, double))
     torch.testing.assert_close(one.images, other.images, atol=2e-2, rtol=0)
     learned = adapter.rendering_field(double, adapter.adapted_weights(double))
-    assert stack(learned, HullBlend().adapt_to(double.planes), 0.3).render(cameras).images.dtype == torch.float32
+    stacked = stack(learned, HullBlend().adapt_to(double.planes), 0.3)
+    assert stacked.render(cameras).images.dtype == torch.float32
+    for field in (stack(*both(support), 0.3), stacked):
+        for dtype in (torch.float32, torch.float64):
+            assert field.trace(support.rays(0).to(dtype), differentiable=False).colour.dtype == field.dtype
     expected = hull_share(hold_out(model(empty=True), support))
     assert hull_share(hold_out(model(empty=True).double(), support.to(dtype=torch.float64))) == pytest.approx(
         expected, abs=1e-3
@@ -286,6 +291,14 @@ def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share, gate
     fresh = random_model(replace(adapter.config, gated=gated), 0).config
     assert not fresh.stacked
     assert not fresh.gated
+
+
+def test_another_sampler_is_that_of_the_fields_before_and_after_gradient_steps():
+    learned, _ = both(ball_views(ring(5, (24, 24))))
+    averaged, other, cameras = average(learned, learned, 0.5), Hierarchical(4, 4), ring(1, (12, 12), shift=1)
+    expected = learned.render(cameras, other)
+    for found in (averaged.with_sampling(other).render(cameras), averaged.render(cameras, other)):
+        torch.testing.assert_close(found.images, expected.images)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9])

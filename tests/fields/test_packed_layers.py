@@ -203,7 +203,7 @@ def test_the_kernel_is_that_of_the_processor_and_the_compiler(  # noqa: PLR0913
 
 def test_packed_layers_stay_in_their_process():
     """Another one may have another kernel, and to Linux has to ask for the registers of AMX itself."""
-    with pytest.raises(TypeError, match="packed layers: expected to be packed anew in each process"):
+    with pytest.raises(TypeError, match="packed layers: expected to be packed again in each process"):
         pickle.dumps(PackedLayers.of(layers_of(2, 64, 5, 1), 1))
 
 

@@ -88,8 +88,8 @@ def test_fine_tuning_takes_the_rates_that_were_measured(trainable, rate):
     model = awaken(small_model())
     context = model.prepare(ball_views(ring(4)))
     settings = FineTuning(trainable)
-    descent, variables = make_descent(model, context, settings)
-    moments = [value for value in variables.tensors if value.ndim == 1 or trainable == "hypernetwork"]
+    descent = make_descent(model, context, settings)
+    moments = [value for value in descent.tensors if value.ndim == 1 or trainable == "hypernetwork"]
     before = [value.detach().clone() for value in moments]
     steps = descent.run(10)
     assert [next(steps), next(steps)] == [0, 1]

@@ -192,6 +192,14 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
             ["--model.symmetry.plane.normal", "[1, 0, .nan]"],
             "plane.normal: expected finite numbers, got a tuple of 1.0,",
         ),
+        (
+            ["--model.network.density-scale", "0"],
+            "--model.network.density-scale: expected more than 0 and finite, got 0",
+        ),
+        (
+            ["--model.initialisation", "{inner_rate: -1}"],
+            "--model.initialisation.inner-rate: expected a finite number of 0 or more, got -1",
+        ),
         (["--model.hull-share", "2"], "--model.hull-share: expected a share from 0 to 1, got 2.0"),
         (
             ["--model.symmetry", "{plane: {normal: [1, 0, 0]}, order: 1000}"],
@@ -200,7 +208,9 @@ def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
         (["--training.optimiser", "sgd"], "--training.optimiser: expected one of 'adam', 'muon', got 'sgd'"),
         (["--model.network.grid", "8"], "--model.network.grid: an unknown entry"),
         (["--model.network", "3"], "--model.network: expected its entries by name, got 3"),
-        (["--training.rays", "["], "--training.rays: expected a plain value"),
+        (["--training.rays", "["], "--training.rays: expected a plain value, got '['"),
+        (["--training.rays", "!!int ''"], "--training.rays: expected a plain value"),
+        (["--training.rays", "[" * 3000], "[[[ (maximum recursion depth exceeded"),
         (["--method", "magic"], "method: expected one of hyperplanes, "),
         (["--config", "OUT/none.yaml"], "none.yaml: expected a YAML file of settings"),
         (["--steps", "0"], "--steps: expected a whole number from 1 to 9999999999, got 0"),
@@ -222,6 +232,7 @@ def test_a_wrong_setting_is_one_line(settings, words, tmp_path, capsys):
         ("a: &x [1]\nb: *x\n", "an alias"),
         ("trainig: {}\n", "trainig: an unknown entry; did you mean training?"),
         ("model: 3\n", "expected model of type dict, found int"),
+        ("model: {network: {width: 4, width: 8}}\n", "found the entry 'width' more than once"),
         ("a: !!python/object/apply:os.system [ls]\n", "expected YAML"),
         ("", "expected a mapping of settings, found a NoneType"),
     ],

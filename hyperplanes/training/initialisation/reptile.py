@@ -40,10 +40,10 @@ class Reptile(InitialisationObjective):
             episode, generator = draw.episode, draw.generator
             # gradient steps from theta on rays of its support views
             settings = replace(self.initialisation.descent(self.config.rays), seed=draw_seed(generator))
-            descent, variables = make_descent(self.model, episode.prepared, settings, start=theta)
+            descent = make_descent(self.model, episode.prepared, settings, start=theta)
             for _ in descent.run(self.initialisation.inner_steps):
                 pass
-            weights = variables.weights().detach()
+            weights = descent.weights().detach()
             adapted.append(weights)
             field = self.model.field(episode.prepared, weights)
             # what is reported: the loss of query rays there
