@@ -162,7 +162,7 @@ def remarks(report: GenerationReport, out: Path) -> list[str]:
     ]
     if report.duplicates:
         lines.append(
-            f"left out, for they hold objects that are taken in another format: {len(report.duplicates)} of the files "
+            f"left out, as the same objects are taken in another format: {len(report.duplicates)} of the files "
             f"({_some(report.duplicates)}), listed in {out / 'manifest.json'} under skipped"
         )
     return lines

@@ -85,13 +85,12 @@ class GenerationConfig:
         layout, preset = LAYOUTS[self.layout], RIG_PRESETS.get(self.rig)
         if self.resolution is not None and layout.resolution not in (None, self.resolution):
             raise ValueError(
-                f"resolution: the {self.layout} layout's loaders take {layout.resolution} for granted, "
-                f"got {self.resolution}"
+                f"resolution: the {self.layout} layout's loaders assume {layout.resolution}, got {self.resolution}"
             )
         if self.field_of_view is not None and layout.field_of_view not in (None, self.field_of_view):
             raise ValueError(
-                f"field_of_view: the {self.layout} layout's loaders take {layout.field_of_view:.4g} degrees for "
-                f"granted, got {self.field_of_view:g}"
+                f"field_of_view: the {self.layout} layout's loaders assume {layout.field_of_view:.4g} degrees, "
+                f"got {self.field_of_view:g}"
             )
         if not 1 <= self.supersample <= MAX_SUPERSAMPLE:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, got {self.supersample}")

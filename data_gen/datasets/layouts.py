@@ -217,7 +217,7 @@ def _check_lens(rig: Rig, layout: str, *, centred: bool) -> None:
     if wrong:
         fx, fy, x, y = lens[0, 0, 0], lens[0, 1, 1], lens[0, 0, 2] + 0.5, lens[0, 1, 2] + 0.5
         raise ValueError(
-            f"layout {layout}: expected {where}, for it holds no other, got focal lengths {fx:g}, {fy:g} and the point "
+            f"layout {layout}: expected {where}, as it stores no other, got focal lengths {fx:g}, {fy:g} and the point "
             f"{x:g}, {y:g} of {rig.width} x {rig.height}; take the native layout"
         )
 

@@ -308,7 +308,7 @@ def _geometry(
         keywords["visual"] = TextureVisuals(material=PBRMaterial(baseColorFactor=DEFAULT_COLOUR, metallicFactor=0.0))
     if vertices.shape[1] >= 6 and "vertex_colors" not in keywords:
         warnings.append(
-            f"{name}: vertex colours left out, the material counts"
+            f"{name}: vertex colours left out, its material is drawn instead"
             if material is not None
             else f"{name}: vertex colours left out, some vertices have none"
         )
