@@ -1,4 +1,4 @@
-"""The verbs that data_gen adds to `hyperplanes`, one a module; pyproject.toml names them as entry points."""
+"""The commands that data_gen adds to `hyperplanes`, one a module, by entry points in pyproject.toml."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What data_gen adds to `hyperplanes doctor`: a probe of each renderer."""
+"""The check that data_gen adds to `hyperplanes doctor`: a probe of each renderer."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ __all__ = ["examine_renderers"]
 
 
 def examine_renderers() -> list[Check]:
-    """Draw a triangle with each renderer, each in a process of its own; any one that works will do.
+    """Draw a triangle with each renderer, each in a process of its own; one that works is enough.
 
     Returns:
-        One outcome a renderer, and one for all of them.
+        One outcome for all renderers, and one for each.
     """
     from data_gen.rendering.renderers import probe_all
 
@@ -26,7 +26,7 @@ def examine_renderers() -> list[Check]:
 
 
 def _reason(message: str) -> str:
-    """A message without the class of its exception and the remedy, which is printed separately."""
+    """A message without its exception class and its remedy, which is printed separately."""
     text = message.partition(" Remedy:")[0].rstrip(".")
     kind, found, rest = text.partition(": ")
     return rest if found and kind.endswith("Error") and " " not in kind else text

@@ -1,8 +1,8 @@
-"""Render meshes into a data set of posed images, as many cameras an object as you like.
+"""Render meshes into a data set of posed images, with any number of cameras per object.
 
-The meshes are procedural (--class, an endless supply) or yours (--meshes, a folder with GLB, glTF, OBJ, PLY, STL, OFF
-or DAE files at any depth). An object that cannot be drawn is skipped, named, and listed in the data set's manifest.
-Interrupted, the same command goes on where it stopped and ends with the same bytes.
+The meshes are procedural (--class, any number of objects) or yours (--meshes, a folder with GLB, glTF, OBJ, PLY, STL,
+OFF or DAE files at any depth). An object that cannot be drawn is skipped with a warning and listed in the data set's
+manifest. After an interruption, the same command resumes and gives the same bytes.
 
 Example:
     hyperplanes generate --class car --count 70 --resolution 64 --seed 0 --out data/cars
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Arguments", "remarks", "run", "source_of", "summary"]
 
 BROUGHT = {"Classes": "data_gen.shapes"}
-"""Groups of entry points whose names are classes."""
+"""Entry point groups whose names are classes."""
 
 
 @dataclass(frozen=True)
@@ -38,37 +38,36 @@ class Arguments:
 
     Attributes:
         out: The folder to write: new, empty, or one in which the same command was interrupted.
-        class_name: Procedural objects of this class: car, chair, plane, lamp, or random, which composes
-            primitives that mean nothing; or one of another installed package.
+        class_name: Procedural objects of this class: car, chair, plane, lamp, or random (arbitrary compositions of
+            primitives); or a class of another installed package.
         meshes: A folder of mesh files, instead of --class.
-        meshes_class: What the meshes are, where their tree does not say it: layouts of other projects name folders so.
-        count: How many procedural objects, the held-out ones included; 70 when not given.
-        seed: Of the procedural shapes and of random rigs and lights.
-        resolution: Pixels along a side of the square images; when not given 200 in the layout hyperplanes-200, else
-            those of the data set that the rig is of, else 64.
-        views: Cameras an object, alternately support and query; those of the data set that the rig is of, else 50, when
-            not given.
-        held_out: Objects of each class for the test split: a count, or a fraction below 1. A seventh when not given; of
-            mesh files the split that their tree states, else a fifth.
-        rig: Where the cameras stand: the same places for all objects, random ones, a circle, a spiral, or as in one
-            of the two data sets of the paper or in SRN's, with its distance, lens and resolution.
-        distance: Of the cameras from the object's centre, in radii of the object; what the rig or the layout is made
-            for, else 3, when not given.
-        field_of_view: Of the cameras in degrees; when not given that of the layout or of the data set that the rig is
-            of, at any distance, else the object just fits.
-        lighting: Where the light comes from.
-        layout: How the files lie: native, or as another project's loader reads them.
-        up: The axis that points up in OBJ, PLY, STL and OFF files, which do not say it; glTF is y up by its
-            specification, and COLLADA declares its own.
+        meshes_class: Class of the meshes, if their tree does not state it; some layouts name folders by it.
+        count: Number of procedural objects, including the held-out ones; 70 when not given.
+        seed: Seed of procedural shapes and of random rigs and lights.
+        resolution: Pixels along a side of the square images; when not given, 200 in the layout hyperplanes-200, else
+            that of the rig's data set, else 64.
+        views: Cameras per object, alternately support and query; when not given, that of the rig's data set, else 50.
+        held_out: Objects of each class for the test split: a count, or a fraction below 1. When not given, a seventh;
+            for mesh files the split that their tree states, else a fifth.
+        rig: Camera positions: the same for all objects, random, a circle, a spiral, or as in one of the paper's two
+            data sets or SRN's, with its distance, lens and resolution.
+        distance: Distance of the cameras from the object's centre, in radii of the object; when not given, that of the
+            layout or the rig's data set, else 3.
+        field_of_view: Field of view of the cameras in degrees; when not given, that of the layout or the rig's data
+            set, at any distance, else such that the object just fits.
+        lighting: Lights: fixed in the world (studio), at the camera (headlight), or random for each object.
+        layout: Layout of the files: native, or that of another project's loader.
+        up: The axis that points up in OBJ, PLY, STL and OFF files, which do not state it; in glTF it is y, and COLLADA
+            declares its own.
         up_of: Exceptions, for files of any format: a file, a folder or a pattern, and its axis: scans=z 'old/*.glb=z'.
-        split_file: ShapeNet's official all.csv, which says what each model of the tree is for.
-        channels: What is written of every view; more than rgba needs the native layout.
-        workers: Processes; as many as there are cores when not given.
+        split_file: ShapeNet's official all.csv, which assigns the models of the tree to splits.
+        channels: Channels to write for every view; more than rgba needs the native layout.
+        workers: Number of processes; one per core when not given.
         engine: Worker processes of this machine, or a Ray cluster.
-        timeout: Seconds that an object may take; one that takes longer is skipped and named.
+        timeout: Seconds that an object may take; slower ones are skipped with a warning.
         supersample: Samples along a side of a pixel, each of them shaded.
-        renderer: pyrender-egl, pyrender-osmesa or embree; the best that works here when not given.
-        verify: Compare all files with their checksums at the end, as objects of an interrupted call always are.
+        renderer: pyrender-egl, pyrender-osmesa or embree; when not given, the best that works here.
+        verify: Compare all files with their checksums at the end; files of an interrupted call always are.
     """
 
     out: Path
@@ -103,10 +102,10 @@ COUNT = 70  # procedural objects
 
 
 def source_of(arguments: Arguments) -> Procedural | MeshFolder:
-    """Where the objects come from.
+    """The source of objects.
 
     Raises:
-        ValueError: both or none of --class and --meshes, an option of the other one, or a class that there is not.
+        ValueError: both or none of --class and --meshes, an option of the other one, or an unknown class.
     """
     from data_gen.datasets.generate import MeshFolder, Procedural
     from data_gen.shapes import check_class
@@ -142,7 +141,7 @@ def summary(report: GenerationReport, out: Path) -> str:
 
 
 def remarks(report: GenerationReport, out: Path) -> list[str]:
-    """One line about each set of objects or files that a user should look at, and where they are listed."""
+    """One line about each set of objects or files that the user should check, and where they are listed."""
     others = [name for name in report.warned if name not in set(report.incomplete)]
     found = {
         ("not in the split file, so trained on", "not_in_split_file"): report.unlisted,
@@ -163,14 +162,14 @@ def remarks(report: GenerationReport, out: Path) -> list[str]:
     ]
     if report.duplicates:
         lines.append(
-            f"left out, for they hold objects that are taken in another format: {len(report.duplicates)} of the files "
+            f"left out, as the same objects are taken in another format: {len(report.duplicates)} of the files "
             f"({_some(report.duplicates)}), listed in {out / 'manifest.json'} under skipped"
         )
     return lines
 
 
 def _some(names: list[str]) -> str:
-    """The first of some names."""
+    """The first few names."""
     return ", ".join(names[:3]) + ", ..." * (len(names) > 3)
 
 

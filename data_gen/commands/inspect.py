@@ -1,10 +1,9 @@
-"""Say what is in a data set or a checkpoint, and whether it is as it should be.
+"""Describe a data set or a checkpoint, and check it.
 
-Of a data set: counts, splits, bounds, what was skipped, whether the poses agree with the masks (OpenCV poses declared
-as OpenGL are recognised), and two pictures: a contact sheet, and the cameras around the object. Of a single scene also
-which sides its views cover, how much they have in common, reprojection errors where a sparse reconstruction lies beside
-it, the worst views, and what to expect, tried with `small` on views left out. Ends with exit code 1 when something is
-wrong with it.
+For a data set: counts, splits, bounds, skipped objects, whether the poses agree with the masks (OpenCV poses declared
+as OpenGL are recognised), and two pictures: a contact sheet, and the cameras around the object. For a single scene also
+the sides that its views cover, their overlap, reprojection errors if there is a sparse reconstruction, the worst views,
+and the quality to expect, measured with `small` on left-out views. The exit code is 1 if a check fails.
 
 Example:
     hyperplanes inspect data/cars
@@ -32,14 +31,14 @@ __all__ = ["Arguments", "baked_lines", "checkpoint_lines", "recorded_diagnostics
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to look at.
+    """What to inspect.
 
     Attributes:
         path: A data set in any layout, a folder of posed images, a checkpoint, a folder of these such as `demo` writes,
-            a baked file, or what comes with the package: small, small-paper, cars-64, example-car.
-        out: Where the pictures go; runs/inspect/NAME when not given.
-        objects: How many objects to look at closely.
-        checksums: Compare every file with its checksum in the manifest, too.
+            a baked file, or one of the package: small, small-paper, cars-64, example-car.
+        out: Folder for the pictures; runs/inspect/NAME when not given.
+        objects: Number of objects to inspect closely.
+        checksums: Also compare every file with its checksum in the manifest.
     """
 
     path: tyro.conf.Positional[Path]
@@ -49,7 +48,7 @@ class Arguments:
 
 
 def checkpoint_lines(folder: Path) -> list[str]:
-    """What a checkpoint holds, a line a fact."""
+    """The content of a checkpoint, one fact per line."""
     from hyperplanes.adaptation.checkpoints import checkpoint_folder
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.hypernetwork import ImageHyperNetworkConfig
@@ -90,7 +89,7 @@ def _training_line(state: dict[str, Any]) -> str:
 
 
 def baked_lines(path: Path) -> list[str]:
-    """What a baked file holds, a line a fact."""
+    """The content of a baked file, one fact per line."""
     from hyperplanes.fields.baked import BakedField
 
     field = BakedField.load(path)
@@ -107,7 +106,7 @@ def baked_lines(path: Path) -> list[str]:
 
 
 def recorded_diagnostics(folder: Path) -> Diagnostics | None:
-    """The diagnostics that the training of a checkpoint recorded last, beside its weights."""
+    """The last diagnostics that the training of a checkpoint recorded beside its weights."""
     from hyperplanes.adaptation.diagnostics import Diagnostics
     from hyperplanes.utilities.checkpoints import read_json
 
@@ -117,7 +116,7 @@ def recorded_diagnostics(folder: Path) -> Diagnostics | None:
 
 
 def _is_checkpoint(path: Path) -> bool:
-    """Whether a checkpoint lies there, or a packaged one has that name."""
+    """Whether this is a checkpoint, or the name of a packaged one."""
     from hyperplanes.adaptation.checkpoints import checkpoint_folder
     from hyperplanes.utilities.checkpoints import CheckpointError
 
@@ -128,7 +127,7 @@ def _is_checkpoint(path: Path) -> bool:
 
 
 def _parts(folder: Path) -> list[Path]:
-    """The checkpoints and data sets in a folder such as `demo` writes; none of a folder that is a data set itself."""
+    """The checkpoints and data sets in a folder such as `demo` writes; empty for a folder that is a data set."""
     if not folder.is_dir() or (folder / "manifest.json").exists():
         return []
     names = ("*/model.json", "*/manifest.json", "first/*/manifest.json")
@@ -136,7 +135,7 @@ def _parts(folder: Path) -> list[Path]:
 
 
 def run(arguments: Arguments) -> int:
-    """Describe it; 1 when a data set is not as it should be."""
+    """Describe it; exit code 1 if a check of a data set fails."""
     console = Console()
     if not _is_checkpoint(arguments.path) and (parts := _parts(arguments.path)):
         out, codes = arguments.out or Path("runs/inspect") / arguments.path.resolve().name, []

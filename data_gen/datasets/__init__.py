@@ -1,1 +1,1 @@
-"""Objects to data sets: `generate` sends the objects of a source through workers into the files of a layout."""
+"""Generation of data sets: workers render the objects of a source and write the files of a layout."""

@@ -1,4 +1,4 @@
-"""The configuration of a generation, and what it resolves to for every object."""
+"""The configuration of a generation, and its resolution for each object."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from hyperplanes.utilities.errors import did_you_mean
 __all__ = ["ENGINES", "GenerationConfig"]
 
 ENGINES = ("local", "ray")
-"""Where objects are rendered: worker processes of this machine, or a Ray cluster."""
+"""Where objects are rendered: in worker processes of this machine, or on a Ray cluster."""
 
 VIEWS, RESOLUTION = 50, 64
 FEWEST_VIEWS = 2
-MOST_VIEWS, MOST_SAMPLES, MOST_BYTES = 10_000, 16_384, 4 * 2**30  # an object; along a side; of all its pictures
+MOST_VIEWS, MOST_SAMPLES, MOST_BYTES = 10_000, 16_384, 4 * 2**30  # per object; along a side; of all its pictures
 EXTRA_CHANNELS = {"depth": 4, "normals": 12, "coordinates": 12, "mesh": 0}  # bytes a pixel
-_UNSEEN = {"held_out", "workers", "engine", "timeout", "recycle"}  # fields that no picture depends on
+_UNSEEN = {"held_out", "workers", "engine", "timeout", "recycle"}  # fields that do not affect pictures
 
 
 @dataclass(frozen=True)
@@ -33,20 +33,20 @@ class GenerationConfig:
     Attributes:
         rig: "fixed" (the same poses for all objects), "random" (on the sphere), "hemisphere", "orbit", "spiral", or a
             name in `data_gen.rigs.RIG_PRESETS`.
-        views: pictures an object, alternately support and query; the preset's when None, else 50.
-        resolution: pixels along a side; what the layout's loaders assume or the preset has when None, else 64.
+        views: pictures per object, alternately support and query; the preset's when None, else 50.
+        resolution: pixels along a side; when None, what the layout's loaders assume or the preset's, else 64.
         lighting: "studio", "headlight" or "random".
         channels: "rgba" and any of "depth", "normals", "coordinates", "mesh"; more than rgba needs the native layout.
         held_out: objects for the test split, a count or a fraction below 1; see `data_gen.datasets.sources.list_items`.
         workers: processes; as many as cores when None.
         engine: "local", or "ray" for a Ray cluster.
         layout: a name in `data_gen.datasets.layouts.LAYOUTS`.
-        seed: of random rigs and lights; shapes have their own in the source.
-        distance: of the cameras from the object's centre in object radii; what suits the layout or the preset when
-            None.
+        seed: of random rigs and lights; that of shapes belongs to the source.
+        distance: of the cameras from the object's centre in object radii; when None, what suits the layout or the
+            preset.
         field_of_view: in degrees; the preset's when None, or the object just fits.
         supersample: samples along a side of a pixel.
-        renderer: a name in `data_gen.rendering.renderers.RENDERERS`; the best that works here when None.
+        renderer: a name in `data_gen.rendering.renderers.RENDERERS`; when None, the best that works here.
         timeout: seconds an object may take.
         recycle: objects after which a worker is replaced.
     """
@@ -69,11 +69,11 @@ class GenerationConfig:
     recycle: int = 200
 
     def resolve(self) -> GenerationConfig:
-        """Check everything, and settle what was left open: by the layout, else by the preset, else by default.
+        """Check everything, and fill in missing values from the layout, else the preset, else defaults.
 
         Returns:
-            What decides the pictures has a value, but for the field of view, None where the object just fits, and the
-            distance, None where it is what suits the layout's loaders and may differ between classes.
+            A configuration in which all that affects pictures has a value, except for a field of view of None, with
+            which the object just fits, and a distance of None, which depends on the layout and the class.
 
         Raises:
             ValueError: if a name is unknown, a number makes no sense, or no renderer works.
@@ -85,13 +85,12 @@ class GenerationConfig:
         layout, preset = LAYOUTS[self.layout], RIG_PRESETS.get(self.rig)
         if self.resolution is not None and layout.resolution not in (None, self.resolution):
             raise ValueError(
-                f"resolution: the {self.layout} layout's loaders take {layout.resolution} for granted, "
-                f"got {self.resolution}"
+                f"resolution: the {self.layout} layout's loaders assume {layout.resolution}, got {self.resolution}"
             )
         if self.field_of_view is not None and layout.field_of_view not in (None, self.field_of_view):
             raise ValueError(
-                f"field_of_view: the {self.layout} layout's loaders take {layout.field_of_view:.4g} degrees for "
-                f"granted, got {self.field_of_view:g}"
+                f"field_of_view: the {self.layout} layout's loaders assume {layout.field_of_view:.4g} degrees, "
+                f"got {self.field_of_view:g}"
             )
         if not 1 <= self.supersample <= MAX_SUPERSAMPLE:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, got {self.supersample}")
@@ -120,11 +119,11 @@ class GenerationConfig:
             field_of_view=layout.field_of_view or field_of_view,
             channels=channels,
         )
-        config.make_rig("")  # numbers that make no sense show here, not in every worker
+        config.make_rig("")  # invalid numbers raise here, not in every worker
         return replace(config, renderer=find_renderer(self.renderer).name)
 
     def make_rig(self, name: str, class_name: str | None = None) -> Rig:
-        """The cameras of an object, of a resolved configuration.
+        """The cameras of an object, for a resolved configuration.
 
         Random rigs depend on the object's name, and the distance may depend on its class.
         """
@@ -135,13 +134,13 @@ class GenerationConfig:
         return make_rig(self.rig, self.views, self.resolution, seed=self.seed_for("rig", name), **lens)
 
     def check_class(self, class_name: str | None) -> None:
-        """Refuse a class that the layout's loaders do not know, or of which they would not see all.
+        """Refuse a class that the layout's loaders do not know, or whose objects they would not see completely.
 
         Args:
-            class_name: of objects, None where it is not known.
+            class_name: of objects; None if unknown.
 
         Raises:
-            ValueError: the class or the distance is none for this layout.
+            ValueError: the class or the distance does not suit the layout.
         """
         layout, rig = LAYOUTS[self.layout], self.make_rig("", class_name)
         if layout.classes is not None and class_name not in layout.classes:
@@ -162,7 +161,7 @@ class GenerationConfig:
         return seed_of(self.seed, purpose, name) % 2**32
 
     def as_json(self) -> dict[str, Any]:
-        """What decides the pictures of an object, as JSON has it."""
+        """The values that affect pictures, as JSON."""
         fields = asdict(self) | {"channels": list(self.channels)}
         return {name: value for name, value in fields.items() if name not in _UNSEEN}
 
@@ -187,7 +186,7 @@ class GenerationConfig:
 
 
 def _check_sizes(views: int, resolution: int, supersample: int, channels: Sequence[str]) -> None:
-    """Sizes are checked before anything is allocated; the pictures of one object are in memory at once."""
+    """Check sizes before anything is allocated: all pictures of an object are in memory at once."""
     if not FEWEST_VIEWS <= views <= MOST_VIEWS:
         wanted = f"{FEWEST_VIEWS} (support and query) to {MOST_VIEWS:,} an object"
         raise ValueError(f"views: expected {wanted}, got {views:,}")

@@ -1,4 +1,4 @@
-"""Many small pictures on one: how a person checks a data set at a glance."""
+"""Contact sheets: many small pictures in one, to check a data set at a glance."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def contact_sheet(images: Sequence[np.ndarray], columns: int, labels: Sequence[s
     Args:
         images: arrays (H, W, 3) or (H, W, 4), uint8 sRGB, all of one height and width; alpha is straight and composited
             over white.
-        columns: images a row.
-        labels: a caption under each image, cut to its width; none if absent.
+        columns: images per row.
+        labels: a caption under each image, truncated to its width; none if absent.
 
     Returns:
         The sheet (rows * cell height, columns * cell width, 3), uint8, 4 pixels between the images.

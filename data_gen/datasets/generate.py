@@ -22,10 +22,10 @@ from hyperplanes.utilities.files import DataError
 __all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
 
 PICTURES = 5
-"""Raised whenever the same arguments come to give other bytes, so that no data set is made half of each."""
+"""Version of the pictures, increased whenever the same arguments give other bytes, so that none are mixed."""
 
 MOST_OBJECTS = 1_000_000
-"""Objects of a data set; the manifest of more could be read by nobody."""
+"""Most objects of a data set; a larger manifest could not be read."""
 
 TARGET = "data_gen.datasets.objects:open_renderer"
 
@@ -35,18 +35,18 @@ class GenerationReport:
     """The outcome of a generation.
 
     Attributes:
-        written: objects in the data set, those of an earlier, interrupted call included.
+        written: objects in the data set, including those of an earlier, interrupted call.
         skipped: names and reasons of objects that are not in it.
-        seconds: that this call took.
-        images_per_second: that this call wrote.
+        seconds: duration of this call.
+        images_per_second: images written per second by this call.
         reused: objects that an earlier call had written.
-        splits: how many objects are in each split.
-        requested: how many were to be in it; at least one to test on where any were to be held out.
-        unlisted: objects that the split file does not name, and that are trained on.
-        incomplete: objects that are drawn without a texture or another file that they name.
-        warned: objects with warnings, of which those with lost files are some.
+        splits: number of objects in each split.
+        requested: number of objects that each split should have; at least one for testing if any were to be held out.
+        unlisted: objects that the split file does not name, which are trained on.
+        incomplete: objects drawn without a texture or another file that they name.
+        warned: objects with warnings, including those with lost files.
         changed: objects that an earlier call had written from other files.
-        duplicates: mesh files that hold one of the objects in another format, which are not among `skipped`.
+        duplicates: mesh files of the same objects in other formats, not included in `skipped`.
     """
 
     written: int
@@ -72,14 +72,14 @@ def generate(
 ) -> GenerationReport:
     """Render objects into a data set.
 
-    The same arguments give the same bytes, however often the work was interrupted, on any number of workers. What an
-    earlier call has written is kept, but for meshes whose files have changed, come or gone since. An object that cannot
-    be drawn, takes too long, or whose worker crashes twice, is skipped and listed, as are meshes of formats that are
-    not read; the rest goes on.
+    The same arguments give the same bytes, regardless of interruptions and the number of workers. Objects of an earlier
+    call are kept, except for meshes whose files have changed, appeared or disappeared since. An object that cannot be
+    drawn, takes too long, or whose worker crashes twice, is skipped and listed, as are meshes of unsupported formats;
+    the others are not affected.
 
     Args:
         source: procedural objects or mesh files.
-        out: the folder; new, empty, or one in which the same generation was interrupted or ended.
+        out: the folder; new, empty, or with the same generation, interrupted or finished.
         config: how they are rendered; the defaults of `GenerationConfig` when None.
         progress: called with (objects done, objects in all, name) after each object.
 
@@ -167,7 +167,7 @@ def generate(
 def _configuration(
     source: Source, items: list[Item], render: GenerationConfig, held_out: float | int | None
 ) -> dict[str, Any]:
-    """What decides the bytes, without a path of this machine."""
+    """Everything that affects the bytes, without paths of this machine."""
     if isinstance(source, Procedural):
         described = asdict(source)
     else:
@@ -184,7 +184,7 @@ def _configuration(
 
 
 def _has_changed(item: Item, entry: Entry, meshes: str | None) -> bool:
-    """Whether the files of a mesh are others than those that it was drawn from, or their place is."""
+    """Whether a mesh's files, or their place, differ from those that it was drawn from."""
     if item.path is None or meshes is None:
         return False
     from data_gen.meshes.model_folder import model_checksums
@@ -194,7 +194,7 @@ def _has_changed(item: Item, entry: Entry, meshes: str | None) -> bool:
 
 
 def _without_path(reason: str, source: Source) -> str:
-    """A reason in which mesh files are named from their folder on, so that no path of this machine is written."""
+    """A reason with mesh files named relative to their folder, so that no path of this machine is written."""
     if isinstance(source, Procedural):
         return reason
     folder = Path(source.path)
@@ -204,7 +204,7 @@ def _without_path(reason: str, source: Source) -> str:
 
 
 def _facts(render: GenerationConfig, classes: list[str | None]) -> dict[str, Any]:
-    """What readers of the data set want to know of all its objects."""
+    """Facts about all objects for readers of the data set."""
     scale, rigs = LAYOUTS[render.layout].scale, [render.make_rig("", name) for name in classes]
     return {
         "layout": render.layout,

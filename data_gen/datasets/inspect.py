@@ -1,6 +1,6 @@
 """Inspect a data set: contact sheet, cameras around the visual hull, counts, bounds, and the conventions check.
 
-Of a single scene also what its views cover and have in common, the worst of them, and what to expect.
+For a single scene also the coverage and overlap of its views, the worst of them, and the quality to expect.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from hyperplanes.utilities.writing import write_whole
 __all__ = ["Inspection", "inspect"]
 
 _OBJECTS, _VIEWS, _FRUSTUM = 8, 10, 0.35
-_LONGEST, _TRIED = 320, 96  # pixels of pictures whose coverage is looked at, and of those that a model is tried on
-_POINTS = 5000  # of a sparse reconstruction are drawn
+_LONGEST, _TRIED = 320, 96  # pixels of pictures for coverage, and for the trial of a model
+_POINTS = 5000  # points of a sparse reconstruction that are drawn
 _EDGES = [0, 1, 2, 3, 4, 1, 5, 0, 2, 5, 0, 3, 5, 0, 4, 5]  # of a frustum, from corner to corner; 5 is a gap
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found and written.
+    """The findings and the written files.
 
     Attributes:
         description: `hyperplanes.data.inspection.describe.Description` of the data set.
         files: the pictures that were written.
-        verification: of the checksums, where it was requested.
-        scene: what the views of a single scene cover, a line a fact.
+        verification: result of the checksums, if requested.
+        scene: coverage of the views of a single scene, one fact per line.
     """
 
     description: Any
@@ -49,19 +49,19 @@ class Inspection:
         return damaged or bool(self.description.broken) or not all(one.consistent for one in objects)
 
     def lines(self) -> list[str]:
-        """All of it as text, a line a fact."""
+        """Everything as text, one fact per line."""
         checked = [] if self.verification is None else self.verification.lines()
         return [*self.description.lines(), *self.scene, *checked, *(f"wrote {path}" for path in self.files)]
 
 
 def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS, *, checksums: bool = False) -> Inspection:
-    """Describe a data set, and draw it; of a single scene with masks also try the packaged model `small`.
+    """Describe and draw a data set; on a single scene with masks, also try the packaged model `small`.
 
     Args:
         path: a data set in any layout, or a posed scene.
         out: the folder for contact_sheet.png and cameras.png, and coverage.png of a single scene.
-        objects: how many objects to look at.
-        checksums: compare every file with its checksum in the manifest, too.
+        objects: number of objects to inspect.
+        checksums: also compare every file with its checksum in the manifest.
 
     Returns:
         The description and the files. A data set that cannot be opened is a DataError.
@@ -95,7 +95,7 @@ def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS, *, check
 
 
 def _all_views(data: Any, name: str) -> Any:
-    """All views of an object, small, in a world with y up, the support first."""
+    """All views of an object, reduced, in a world with y up, support first."""
     from hyperplanes.data.inspection.scene import stand_upright
     from hyperplanes.views import join_views
 
@@ -127,7 +127,7 @@ def _sparse(folder: Path, posed: Any) -> Any:
 
 
 def _trial(views: Any) -> list[str]:
-    """How well the packaged model shows views that were left out, in a line; nothing where it cannot be tried."""
+    """One line on how well the packaged model renders left-out views; none if it cannot be tried."""
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.evaluation.suitability import held_out_psnr
 
@@ -143,7 +143,7 @@ def _trial(views: Any) -> list[str]:
 
 
 def _pictures(data: Any, names: list[str]) -> tuple[list[np.ndarray], list[str]]:
-    """Views of each object, a row each; objects whose views differ in size from the first one's are left out."""
+    """Views of each object in a row; objects whose views differ in size from the first one's are left out."""
     first = data.posed(names[0]).support
     pictures, labels = [], []
     for name in names:
@@ -160,8 +160,8 @@ def _cameras(views: Any, support: int, title: str, sparse: Any = None) -> bytes:
     """PNG of the frusta of support (blue) and query (orange) cameras around the hull, or around the bounds.
 
     Args:
-        views: in a world with y up, the support first.
-        support: how many they are.
+        views: in a world with y up, support first.
+        support: number of support views.
         title: of the picture.
         sparse: points of a reconstruction, in the same world; those far away are left out.
     """
@@ -175,7 +175,7 @@ def _cameras(views: Any, support: int, title: str, sparse: Any = None) -> bytes:
         count = len(frusta[half])
         if not count:
             continue
-        # one line with gaps: a line an edge took most of the drawing's time
+        # one line with gaps: a line per edge would take most of the drawing time
         broken = np.concatenate([frusta[half], np.full((count, 1, 3), np.nan)], axis=1)
         line = broken[:, _EDGES].reshape(-1, 3)
         axes.plot(line[:, 0], -line[:, 2], line[:, 1], color=colour, linewidth=0.6)

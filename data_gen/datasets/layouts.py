@@ -1,4 +1,4 @@
-"""How a rendered object is laid out in files: the native layout, and what other projects' loaders read."""
+"""File layouts of rendered objects: the native one, and those of other projects' loaders."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ class RenderedObject:
 
 @dataclass(frozen=True)
 class Layout:
-    """One way to lay objects out.
+    """A file layout.
 
     Attributes:
-        files: from an object to its files, relative path to bytes.
-        splits: from the objects (in order) to the files that say which split they belong to.
-        planes: near and far of the layout's loaders in their world units, by a part of the class's name; "" for all
-            others. None where they read them from the files.
+        files: makes an object's files, relative path to bytes.
+        splits: makes the files that state the splits of the objects (in order).
+        planes: near and far of the layout's loaders in their world units, by part of the class name; "" for all others.
+            None if they read them from the files.
         field_of_view: in degrees that the layout's loaders assume, or None.
         resolution: in pixels that they assume, or None.
-        scale: their world units in one of ours.
-        classes: those that the loaders know, or None for any.
+        scale: their world units per unit of ours.
+        classes: the classes that the loaders know, or None for any.
     """
 
     files: Callable[[RenderedObject], dict[str, bytes]]
@@ -65,7 +65,7 @@ class Layout:
     classes: tuple[str, ...] | None = None
 
     def near_far(self, class_name: str | None) -> tuple[float, float] | None:
-        """Near and far of the loaders for a class, in our world units; None where they read them from the files."""
+        """Near and far of the loaders for a class, in our world units; None if they read them from the files."""
         if self.planes is None:
             return None
         part = next((part for part in self.planes if part and part in (class_name or "")), "")
@@ -73,7 +73,7 @@ class Layout:
         return near / self.scale, far / self.scale
 
     def distance(self, class_name: str | None) -> float:
-        """How far from the origin cameras stand: in the middle of what the loaders look at."""
+        """Distance of the cameras from the origin: the middle of the loaders' depth range."""
         planes = self.near_far(class_name)
         return DEFAULT_DISTANCE if planes is None else sum(planes) / 2
 
@@ -104,10 +104,10 @@ def native(rendered: RenderedObject) -> dict[str, bytes]:
 
 
 def learnit(rendered: RenderedObject) -> dict[str, bytes]:
-    """CLASSs/NAME/transforms.json and CLASSs/NAME/r_000.png and so on, as the learned initialisations' data are.
+    """CLASSs/NAME/transforms.json and CLASSs/NAME/r_000.png and so on, as in the data of learned initialisations.
 
     The JSON has camera_angle_x and the frames' OpenGL poses; pictures are RGBA with straight alpha beside it. Loaders
-    take near 2 and far 6. CLASS_splits.json beside the class folder lists the names (Tancik et al., 2021).
+    assume near 2 and far 6. CLASS_splits.json beside the class folder lists the names (Tancik et al., 2021).
     """
     _check_lens(rendered.rig, "learnit-128", centred=True)
     item, rig = rendered.item, rendered.rig
@@ -131,12 +131,12 @@ def learnit_splits(items: Sequence[Item]) -> dict[str, bytes]:
 
 
 def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
-    """CLASSs/sampled/VIEWS_NAME.npz as the HyperPlanes, MultiPlaneNeRF and points2nerf authors' loaders read it.
+    """CLASSs/sampled/VIEWS_NAME.npz for the loaders of HyperPlanes, MultiPlaneNeRF and points2nerf.
 
     `images` float32 (view, 200, 200, 3) in [0, 1] over white, `cam_poses` float32 (view, 4, 4) OpenGL camera-to-world.
-    Their loaders take 277.77 pixels as the focal length, near 2 and far 6, and split the files sorted by name 80/20.
-    Read by `hyperplanes.data`, ignored by theirs: `rgba` uint8 with straight alpha, `focal` in pixels. Underscores in
-    names become hyphens, for their loaders take what follows the last underscore as the name.
+    Their loaders assume a focal length of 277.77 pixels, near 2 and far 6, and split the files sorted by name 80/20.
+    Read by `hyperplanes.data` and ignored by theirs: `rgba` uint8 with straight alpha, `focal` in pixels. Underscores
+    in names become hyphens, because their loaders take what follows the last underscore as the name.
     """
     _check_lens(rendered.rig, "hyperplanes-200", centred=True)
     item, rig = rendered.item, rendered.rig
@@ -150,10 +150,10 @@ def hyperplanes(rendered: RenderedObject) -> dict[str, bytes]:
 
 
 def check_names(layout: str, names: Sequence[str]) -> None:
-    """Refuse objects that a layout would give one name.
+    """Refuse objects to which a layout would give the same name.
 
     Raises:
-        ValueError: two of them differ by hyphens and underscores alone, in the layout hyperplanes-200.
+        ValueError: two names differ only in hyphens and underscores, in the layout hyperplanes-200.
     """
     if layout != "hyperplanes-200":
         return
@@ -171,8 +171,8 @@ def _hyphenated(name: str) -> str:
 def srn(rendered: RenderedObject) -> dict[str, bytes]:
     """CLASSs_SPLIT/NAME with intrinsics.txt, rgb/000000.png and pose/000000.txt (Sitzmann et al., 2019).
 
-    Poses are OpenCV camera-to-world, 16 numbers in a line, in a world half the size of ours, so that what pixel-nerf's
-    loader sees fits: 0.8 to 1.8, and 1.25 to 2.75 where the class is called chair. intrinsics.txt: focal length and
+    Poses are OpenCV camera-to-world, 16 numbers in a line, in a world half the size of ours, to fit the depth range
+    of pixel-nerf's loader: 0.8 to 1.8, and 1.25 to 2.75 for the class chair. intrinsics.txt: focal length and
     principal point (half-pixel centres); the centre of the scene; near plane; scale; height and width. Pictures are RGB
     over white: the format has no alpha.
     """
@@ -208,7 +208,7 @@ def over_white(rgba: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 
 def _check_lens(rig: Rig, layout: str, *, centred: bool) -> None:
-    """Refuse intrinsics that a layout with one focal length for everything, and perhaps no centre, cannot hold."""
+    """Refuse intrinsics that a layout with a single focal length, and possibly no principal point, cannot store."""
     middle = np.array([[rig.width - 1, rig.height - 1]]) / 2
     lens, where = rig.intrinsics, "one focal length for both axes and all views"
     wrong = np.abs(lens - lens[0]).max() > 1e-6 or abs(lens[0, 0, 0] - lens[0, 1, 1]) > 1e-6
@@ -217,7 +217,7 @@ def _check_lens(rig: Rig, layout: str, *, centred: bool) -> None:
     if wrong:
         fx, fy, x, y = lens[0, 0, 0], lens[0, 1, 1], lens[0, 0, 2] + 0.5, lens[0, 1, 2] + 0.5
         raise ValueError(
-            f"layout {layout}: expected {where}, for it holds no other, got focal lengths {fx:g}, {fy:g} and the point "
+            f"layout {layout}: expected {where}, as it stores no other, got focal lengths {fx:g}, {fy:g} and the point "
             f"{x:g}, {y:g} of {rig.width} x {rig.height}; take the native layout"
         )
 
@@ -238,4 +238,4 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "srn": Layout(srn, planes={"": (0.8, 1.8), "chair": (1.25, 2.75)}, scale=0.5),
 }
-"""Layouts by the name under which the command line knows them."""
+"""Layouts by their names on the command line."""

@@ -1,7 +1,7 @@
 """The manifest of a data set: what was requested, written and skipped, and why; and its verification.
 
-Objects stay folders and files that other projects' loaders read, which the archives of WebDataset or Hugging Face
-datasets are not; so what exists, with its checksums, is kept here as one JSON.
+Objects stay folders and files for other projects' loaders, which cannot read archives of WebDataset or Hugging Face
+datasets; so one JSON file lists what exists, with checksums.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ VERSION = 1
 PROGRESS_FOLDER = ".progress"
 
 _DIFFERENCES = 5
-"""Differences between two configurations that a message names."""
+"""Most differences between two configurations that a message names."""
 
 Entry = dict[str, Any]
 """{"name", "record", "files": {relative path: sha256}} of a finished object."""
@@ -38,12 +38,12 @@ Entry = dict[str, Any]
 
 @dataclass(frozen=True)
 class Verification:
-    """What came of comparing files with their checksums.
+    """The result of comparing files with their checksums.
 
     Attributes:
-        files: how many were compared.
-        missing: relative paths that are not there.
-        changed: relative paths whose content is another.
+        files: number of files compared.
+        missing: relative paths of absent files.
+        changed: relative paths of files with other content.
     """
 
     files: int
@@ -52,11 +52,11 @@ class Verification:
 
     @property
     def intact(self) -> bool:
-        """Whether every file is there and as it was written."""
+        """Whether every file exists unchanged."""
         return not self.missing and not self.changed
 
     def lines(self) -> list[str]:
-        """The outcome as text, a line a fact."""
+        """The result as text, one fact per line."""
         if self.intact:
             return [f"checksums: {self.files:,} files as they were written"]
         return [f"checksums: {name} is missing" for name in self.missing] + [
@@ -71,14 +71,14 @@ def build_manifest(
     skipped: Iterable[tuple[str, str]],
     facts: dict[str, Any],
 ) -> dict[str, Any]:
-    """The manifest of a finished data set; nothing in it depends on when or in which order things were done.
+    """The manifest of a finished data set, independent of time and order of the work.
 
     Args:
-        configuration: what decides the bytes.
+        configuration: everything that affects the bytes.
         items: all requested objects.
         entries: the finished ones.
         skipped: names and reasons of the others.
-        facts: what readers need: layout, scene_sphere, near, far, renderer.
+        facts: for readers: layout, scene_sphere, near, far, renderer.
 
     Returns:
         A JSON-able dictionary.
@@ -104,7 +104,7 @@ def build_manifest(
 
 
 def holds_data_set(folder: Path) -> bool:
-    """Whether `generate` has written a data set into a folder, or begun to."""
+    """Whether a folder holds a data set of `generate`, finished or not."""
     if (folder / PROGRESS_FOLDER / "configuration.json").is_file():
         return True
     with suppress(DataError):
@@ -116,7 +116,7 @@ def verify(folder: str | Path) -> Verification:
     """Compare every file of a data set with its checksum in the manifest.
 
     Returns:
-        What is missing or changed. DataError where there is no manifest, or one without checksums.
+        The missing and changed files. No manifest, or one without checksums, is a DataError.
     """
     folder = Path(folder)
     with malformed(folder / MANIFEST, "a manifest"):
@@ -140,11 +140,11 @@ def _verify(folder: Path) -> Verification:
 
 
 class GenerationState:
-    """What of a data set exists already: the basis of resuming. A context manager that holds the folder's lock.
+    """The existing part of a data set, for resuming. A context manager that holds the folder's lock.
 
     Args:
         out: the folder of the data set.
-        configuration: what decides the bytes of the data set.
+        configuration: everything that affects the bytes of the data set.
 
     Raises:
         DataError: a folder with other content, made with another configuration, or in use by another process.
@@ -162,7 +162,7 @@ class GenerationState:
             stack.enter_context(one_writer(self.out))
             self._check()
             shutil.rmtree(self.scratch, ignore_errors=True)
-            self.scratch.mkdir(parents=True, exist_ok=True)  # a worker of a killed run may still be at its last file
+            self.scratch.mkdir(parents=True, exist_ok=True)  # a worker of a killed run may still write its last file
             (self.folder / "done").mkdir(exist_ok=True)
             write_whole(self.folder / "configuration.json", encode_json(self.configuration), self.scratch)
             self._held = stack.pop_all()
@@ -189,12 +189,12 @@ class GenerationState:
             raise DataError(self.out, f"the data set it holds ({held}{more})", f"a request for {wanted}{more}", remedy)
 
     def done(self) -> dict[str, Entry]:
-        """The finished objects, by name, of which all files are as they were written, by their checksums.
+        """The finished objects, by name, whose files all match their checksums.
 
-        An object without its files, or with files that a power failure has emptied, is made anew.
+        Objects with missing files, or files emptied by a power failure, are rendered again.
 
         Returns:
-            What was noted of each when it was finished.
+            The record of each.
         """
         with malformed(self.out, "an unfinished data set"):
             entries = self._entries()
@@ -216,7 +216,7 @@ class GenerationState:
                 files = record.pop("files", {})
                 entries[name] = {"name": name, "record": record, "files": files}
         for path in sorted((self.folder / "done").glob("*.json")):
-            with suppress(DataError):  # a note that was not whole on the disk when the power went
+            with suppress(DataError):  # a record cut off by a power failure
                 entries[path.stem] = read_json(path)
         return {name: entry for name, entry in entries.items() if isinstance(entry.get("files"), dict)}
 
@@ -225,14 +225,14 @@ class GenerationState:
         for name in entry["files"]:
             path = inside(self.out, name, self.out / MANIFEST)
             path.unlink(missing_ok=True)
-            with suppress(OSError):  # until one holds something else
+            with suppress(OSError):  # up to a folder that is not empty
                 for folder in path.relative_to(self.out).parents[:-1]:
                     (self.out / folder).rmdir()
 
     def finish(self, manifest: dict[str, Any], others: dict[str, bytes]) -> None:
-        """Write what describes the whole, and remove the state of the work.
+        """Write the manifest and other files, and remove the state of the work.
 
-        Everything is put on the disk first: waiting for each of many small files would take longer than making them.
+        All is flushed to the disk at once first: waiting for each of many small files would take longer than writing.
 
         Args:
             manifest: of the data set.

@@ -1,4 +1,4 @@
-"""Render one object and write its files: what a worker process does, again and again."""
+"""Render one object and write its files: the work of a worker process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def open_renderer(settings: dict[str, Any]) -> Callable[[dict[str, Any]], dict[s
 
     Args:
         settings: `out`, the folder of the data set, `render`, a resolved `GenerationConfig` as JSON, and `meshes`, the
-            folder that no mesh may read outside of, or None.
+            folder that meshes may not read outside of, or None.
 
     Returns:
         The function. It raises ValueError, with the reason, for an object that cannot be drawn.
@@ -68,7 +68,7 @@ def _render(renderer: Any, item: Item, config: GenerationConfig, meshes: Path | 
 
 
 def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict[str, Any]:
-    """Write an object's files, then the record that says that they are whole."""
+    """Write an object's files, then the record that they are complete."""
     scratch = out / ".progress" / "unfinished"
     if len(files) > 1:
         folder = os.path.commonpath(files)

@@ -1,8 +1,8 @@
-"""The same work on a Ray cluster: one actor a renderer, an actor's death costs one item. Ray is optional.
+"""The same work on a Ray cluster: one renderer per actor; an actor that dies costs one item. Ray is optional.
 
-Every machine of the cluster needs this package and the folder of the data set (a shared file system). A cluster is
-found through RAY_ADDRESS; without it Ray starts on this machine alone, and ends with the work. Ray's ActorPool has no
-time limit an item and ends with the first actor that dies.
+Every machine of the cluster needs this package and the folder of the data set (a shared file system). RAY_ADDRESS gives
+the cluster; without it Ray starts on this machine alone, and ends with the work. Ray's ActorPool has no time limit per
+item and ends with the first actor that dies.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def run_on_ray(
         target: "module:function", importable on every machine.
         settings: JSON-able.
         items: JSON-able; taken one by one, when an actor is free.
-        workers: how many actors; one a processor of the cluster when None.
+        workers: number of actors; one per processor of the cluster when None.
         timeout: seconds that an item may take before its actor is killed.
         recycle: items after which an actor is replaced by a new one.
 
@@ -58,7 +58,7 @@ def run_on_ray(
 
 
 class _Actor:
-    """What an actor holds: the function that the target gives."""
+    """An actor that holds the function returned by the target."""
 
     def __init__(self, target: str, settings: dict[str, Any]) -> None:
         module, _, function = target.partition(":")

@@ -1,4 +1,4 @@
-"""Where objects come from: an endless supply of procedural ones, or a folder of mesh files."""
+"""Sources of objects: procedural ones, or a folder of mesh files."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Procedural:
 
     Attributes:
         class_name: car, chair, plane, lamp or random.
-        count: how many, the held-out ones included.
-        seed: the training objects are the first ones of one endless sequence, the held-out ones of another; both depend
-            on the seed alone, so data sets of different sizes and one seed share objects, and never mix the two: no
-            object of the two sequences is another one of them.
+        count: number of objects, including the held-out ones.
+        seed: training objects are the first of one endless sequence, held-out ones of another. Both depend on the seed
+            alone, so data sets of different sizes and one seed share objects. No object occurs twice in the two
+            sequences, so training and held-out objects never mix.
     """
 
     class_name: str
@@ -41,10 +41,10 @@ class MeshFolder:
 
     Attributes:
         path: the folder.
-        up: which axis is up, y or z, in files of formats that do not say it: OBJ, PLY, STL and OFF.
-        up_of: exceptions as `PATTERN=AXIS`, for files of any format; the last that fits counts. The pattern is a
-            folder, a file, or one with wildcards (`scans/*.glb`), from `path` on.
-        class_name: of the meshes of which the tree does not state it; some layouts name folders by it.
+        up: the axis that is up, y or z, in formats that do not state it: OBJ, PLY, STL and OFF.
+        up_of: exceptions as `PATTERN=AXIS`, for files of any format; the last that matches counts. The pattern is a
+            folder, a file, or has wildcards (`scans/*.glb`), relative to `path`.
+        class_name: of the meshes whose class the tree does not state; some layouts name folders by it.
         split_file: ShapeNet's official all.csv; models that it does not list are trained on, and the manifest names
             them.
     """
@@ -61,7 +61,7 @@ Source = Procedural | MeshFolder
 
 @dataclass(frozen=True)
 class Item:
-    """One object that is to be rendered.
+    """An object to be rendered.
 
     Attributes:
         name: a plain file name, unique in the data set.
@@ -69,9 +69,9 @@ class Item:
         split: "train", "val" or "test".
         seed: of the procedural shape, or None for a file.
         path: of the mesh file, or None for a procedural shape.
-        source: the same from the folder of meshes on.
-        unlisted: whether a split file decides and does not name it, so that it is trained on.
-        up: the axis that points up in the file, y or z; None for what its format says.
+        source: the same relative to the folder of meshes.
+        unlisted: whether the split file does not name it, so that it is trained on.
+        up: the axis that points up in the file, y or z; None for that of the format.
     """
 
     name: str
@@ -89,9 +89,9 @@ class Listing:
     """The objects of a source.
 
     Attributes:
-        items: those that are to be rendered, training ones first.
-        unreadable: names and reasons of files that are none of them for their format.
-        duplicates: names and reasons of files that hold one of them in another format.
+        items: the objects to be rendered, training ones first.
+        unreadable: names of files in unsupported formats, with reasons.
+        duplicates: names of files that hold one of the objects in another format, with reasons.
     """
 
     items: list[Item]
@@ -108,13 +108,13 @@ def list_items(
 
     Args:
         source: what to list.
-        held_out: how many objects of each class go into the test split: a count, a fraction below 1, or None for one
-            in seven of procedural objects, and for mesh files the split that the tree states, else the last 20 % of
-            each class by name (as the paper's 200x200 data were split).
+        held_out: objects of each class in the test split: a count, a fraction below 1, or None for one in seven of
+            procedural objects, and for mesh files the split that the tree states, else the last 20 % of each class by
+            name (as in the paper's 200x200 data).
         reason_against: as in `find_meshes`.
 
     Returns:
-        The objects. A class that is unknown or a count that makes no sense is a ValueError.
+        The objects. An unknown class or an invalid count is a ValueError.
     """
     procedural = isinstance(source, Procedural)
     listing = Listing(_procedural(source, held_out)) if procedural else _meshes(source, held_out, reason_against)
@@ -123,7 +123,7 @@ def list_items(
 
 
 def seed_of(seed: int, *parts: object) -> int:
-    """A 63-bit seed that depends on a seed and on what it is for, and on nothing else.
+    """A 63-bit seed that depends on a seed and its purpose alone.
 
     >>> seed_of(0, "rig", "car_0000") == seed_of(0, "rig", "car_0000") != seed_of(1, "rig", "car_0000")
     True
@@ -151,9 +151,9 @@ def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
 
 
 def _draw(sequence: np.random.SeedSequence, taken: set[int]) -> int:
-    """The first number of a sequence that none of the objects before has, in data sets of any size.
+    """The first number of a sequence that no earlier object has, in data sets of any size.
 
-    Numbers have 32 bits: of 77,000 objects two would be alike in half of the cases.
+    Numbers have 32 bits: among 77,000, two would be equal with a probability of one half.
     """
     words = 1
     while (seed := int(sequence.generate_state(words)[-1])) in taken:
@@ -193,7 +193,7 @@ def _meshes(source: MeshFolder, held_out: float | int | None, reason_against: Ca
 
 
 def _axes(source: MeshFolder, paths: list[Path]) -> dict[Path, Any]:
-    """Which axis is up in each file; None for what its format says."""
+    """The axis that is up in each file; None for that of the format."""
     axes: dict[Path, Any] = {path: None if path.suffix.lower() in STATES_ITS_AXIS else source.up for path in paths}
     names = {path: path.relative_to(source.path).as_posix() for path in paths}
     for exception in source.up_of:

@@ -1,8 +1,8 @@
 """The loop of a worker process: `python -m data_gen.datasets.worker_process MODULE:FUNCTION`.
 
-Standard input brings one JSON value a line: first the settings, then items. Standard output answers each item with one
-line: {"ok": result}, {"skip": reason} where the item is to blame, {"fatal": reason} where nothing could be done for any
-item. What libraries print goes to standard error. End of input, also when the parent has died, ends the process.
+Standard input has one JSON value per line: first the settings, then items. Standard output answers each item with one
+line: {"ok": result}, {"skip": reason} if the item is at fault, {"fatal": reason} if no item can be processed. Output of
+libraries goes to standard error. The process ends with its input, also when the parent has died.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ def main() -> int:
             answers.write(json.dumps(process_item(process, json.loads(line))) + "\n")
     except BrokenPipeError:
         return 1
-    except Exception as error:  # the renderer cannot be made: no item can be done
+    except Exception as error:  # without a renderer no item can be processed
         answers.write(json.dumps({"fatal": _one_line(error)}) + "\n")
         return 1
     return 0
 
 
 def process_item(process: Callable[[Any], dict[str, Any]], item: Any) -> dict[str, Any]:
-    """Process one item, and catch what it raises.
+    """Process one item and catch exceptions.
 
     Returns:
-        {"ok": result}, {"skip": reason} or {"fatal": reason}; nothing is raised.
+        {"ok": result}, {"skip": reason} or {"fatal": reason}.
     """
     try:
         return {"ok": process(item)}

@@ -1,8 +1,8 @@
 """A pool of worker processes that may crash, hang or be killed, each at the cost of one item.
 
-Workers are started as commands (`python -m data_gen.datasets.worker_process`), not forked and not spawned by
-multiprocessing: OpenGL does not survive a fork, and a script that calls us needs no `if __name__ == "__main__"`.
-concurrent.futures would also lose the other items with a process that crashes, and has no time limit an item.
+Workers are started as commands (`python -m data_gen.datasets.worker_process`), not forked or spawned by
+multiprocessing: OpenGL does not survive a fork, and calling scripts need no `if __name__ == "__main__"`.
+concurrent.futures would also lose other items when a process crashes, and has no time limit per item.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ __all__ = [
 ]
 
 ATTEMPTS = 2
-"""How often an item is tried whose worker crashes."""
+"""How often an item is tried if its worker crashes."""
 
 START_SECONDS = 120.0
-"""Time that a worker has to start, above that of its first item."""
+"""Time that a worker has to start, in addition to that of its first item."""
 
 
 class WorkerError(RuntimeError):
-    """No item can be processed: the workers do not start, or report an error that no item has caused."""
+    """No item can be processed: the workers do not start, or report an error that is not due to an item."""
 
 
 class WorkerLost(Exception):
-    """A worker crashed, or was too slow; the message says which."""
+    """A worker crashed or was too slow, as the message says."""
 
 
 class WorkerTimeout(WorkerLost):
-    """A worker was too slow. It is not tried again: what takes minutes once takes them twice."""
+    """A worker was too slow. Its item is not tried again."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Outcome:
 
     Attributes:
         item: the item.
-        result: what the worker answered, None when it was skipped.
-        reason: why it was skipped, None when it was not.
+        result: the worker's answer; None if the item was skipped.
+        reason: why it was skipped; None if it was not.
     """
 
     item: dict[str, Any]
@@ -71,20 +71,20 @@ class Worker(Protocol):
     """Processes one item after the other."""
 
     def process(self, item: dict[str, Any]) -> dict[str, Any]:
-        """The answer of `worker_process.process_item`; WorkerLost when there is none."""
+        """The answer of `worker_process.process_item`; WorkerLost if there is none."""
         ...
 
     def kill(self) -> None:
-        """End it at once; called from any thread, so that `process` raises WorkerLost."""
+        """End it at once, from any thread; `process` then raises WorkerLost."""
         ...
 
     def stop(self) -> None:
-        """End it after its last item, and free what it holds."""
+        """End it after its last item, and free its resources."""
         ...
 
 
 def worker_environment() -> dict[str, str]:
-    """Environment variables of a worker: it imports this package from here, and uses one core."""
+    """Environment variables of a worker, which imports this package from here and uses one core."""
     root = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     return {"PYTHONPATH": path, "LP_NUM_THREADS": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -102,10 +102,10 @@ def run_isolated(
     """Process items in worker processes of this machine.
 
     Args:
-        target: "module:function"; called with the settings, it gives a function of an item.
+        target: "module:function"; called with the settings, it returns a function of an item.
         settings: JSON-able.
         items: JSON-able; taken one by one, when a worker is free.
-        workers: how many processes.
+        workers: number of processes.
         timeout: seconds that an item may take before its worker is killed.
         recycle: items after which a worker is replaced by a new one.
 
@@ -118,17 +118,17 @@ def run_isolated(
 def run_workers(
     make_worker: Callable[[], Worker], items: Iterable[dict[str, Any]], count: int, recycle: int
 ) -> Generator[Outcome, None, None]:
-    """Process items in workers, each driven by a thread, whose errors are raised here.
+    """Process items in workers, each driven by a thread; errors of the threads are raised here.
 
     Args:
         make_worker: makes a worker.
         items: taken one by one, when a worker is free.
-        count: how many workers.
+        count: number of workers.
         recycle: items after which a worker is replaced by a new one.
 
     Yields:
-        One outcome an item, in the order in which they end. Leaving the loop kills the workers. WorkerError comes
-        out of it when a worker reports that nothing can be done.
+        One outcome per item, in order of completion. Leaving the loop kills the workers. WorkerError is raised when a
+        worker reports that no item can be processed.
 
     Raises:
         ValueError: fewer than one worker.
@@ -136,7 +136,7 @@ def run_workers(
     if count < 1:
         raise ValueError(f"workers: expected at least 1, got {count}")
     pending, lock, stopping = iter(items), threading.Lock(), threading.Event()
-    free = threading.Semaphore(count)  # an item is taken only when the outcome of an earlier one has been handled
+    free = threading.Semaphore(count)  # items are taken only after earlier outcomes have been handled
     ended: SimpleQueue[Outcome | Exception | None] = SimpleQueue()
     alive: set[Worker] = set()
 
@@ -186,7 +186,7 @@ def run_workers(
         except Exception as error:
             ended.put(error)
         finally:
-            free.release()  # for the other threads, which have to see the end of the items, too
+            free.release()  # for the other threads, which must also see the end of the items
             if worker is not None:
                 close_worker(worker, kill=stopping.is_set())
             ended.put(None)
@@ -227,7 +227,7 @@ class _ProcessWorker:
             stdout=subprocess.PIPE,
             stderr=self._log,
             env={**os.environ, **worker_environment()},
-            start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends its workers
+            start_new_session=True,  # Ctrl-C reaches only the parent, which then ends its workers
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -282,5 +282,5 @@ class _ProcessWorker:
         try:
             self._items.write(json.dumps(value).encode() + b"\n")
             self._items.flush()
-        except BrokenPipeError:  # it has ended already, which shows when its answer is read
+        except BrokenPipeError:  # it has ended already; reading its answer reports that
             pass

@@ -1,6 +1,6 @@
-"""Repairs the geometry of a mesh, saying what was wrong: faces that cannot be drawn, normals that cannot be used.
+"""Repairs the geometry of a mesh, with warnings: faces that cannot be drawn, normals that cannot be used.
 
-trimesh's `process=True` says nothing of what it leaves out or merges, and looks at no winding and no normal.
+trimesh's `process=True` does not report what it removes or merges, and checks neither winding nor normals.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from data_gen.meshes.materials import select_vertices, visual_of
 __all__ = ["check_faces", "CREASE", "clean", "decimate", "is_smooth", "smooth_normals"]
 
 CREASE = 40.0
-"""Angle between two faces, in degrees, from which an edge counts as sharp where a file has no normals."""
+"""Angle between two faces, in degrees, from which on an edge is sharp if a file has no normals."""
 
 _MOSTLY = 0.1
-_COINCIDENT = 1e-4  # of the diagonal of its bounding box
-_HULL_FILLED = 0.7  # of the diagonal of a hull, what it is the outline of
+_COINCIDENT = 1e-4  # of the diagonal of a solid's bounding box
+_HULL_FILLED = 0.7  # share of an outline hull's diagonal that the parts inside fill
 _MOST_FACES_TO_CLOSE = 500_000
 
 
 def check_faces(mesh: trimesh.Trimesh, label: str) -> None:
-    """Refuse faces on vertices that are not there.
+    """Refuse faces that refer to missing vertices.
 
     Raises:
-        ValueError: a face refers to a vertex that is not there.
+        ValueError: a face refers to a missing vertex.
     """
     faces, count = np.asarray(mesh.faces, dtype=np.int64), len(mesh.vertices)
     if len(faces) and not (0 <= faces.min() and faces.max() < count):
@@ -41,19 +41,19 @@ def check_faces(mesh: trimesh.Trimesh, label: str) -> None:
 def clean(
     mesh: trimesh.Trimesh, label: str, parts: Sequence[trimesh.Trimesh] = ()
 ) -> tuple[trimesh.Trimesh | None, list[str]]:
-    """Leave out faces that cannot be drawn and vertices without faces, and make normals agree with faces.
+    """Remove faces that cannot be drawn and vertices without faces, and make normals agree with faces.
 
-    What changes no picture gives no warning unless it is so much that the file must be damaged: leaving out faces
-    without area, and turning single normals. Where more than a tenth of the faces lie on the three corners of an
-    earlier one, whichever way round, those are left out: what is left is seen from both sides, and the normals of two
-    faces that are turned against each other would cancel.
+    Changes that do not affect pictures, removing faces without area and flipping single normals, give no warning unless
+    there are so many that the file must be damaged. If more than a tenth of the faces have the three corners of an
+    earlier face, in either winding, they are removed: the remaining ones are visible from both sides, and the normals
+    of two opposite faces would cancel.
 
-    A solid that is wound inside out is turned, unless it is meant: where it lies on another part, whose inner side it
-    is, and where it is the one-sided hull around others that cartoons draw their outlines with.
+    A solid that is wound inside out is flipped, unless that is intended: it is the inner side of another part on which
+    it lies, or the one-sided hull around others that draws cartoon outlines.
 
     Args:
-        mesh: a mesh whose visual is canonical and whose faces have their vertices (`check_faces`); it is not changed.
-        label: what to call it in a warning.
+        mesh: a mesh with a canonical visual and valid faces (`check_faces`); it is not changed.
+        label: its name in warnings.
         parts: all parts of the object, in the same coordinates.
 
     Returns:
@@ -86,10 +86,10 @@ def clean(
 
 
 def is_smooth(mesh: trimesh.Trimesh) -> bool:
-    """Whether a mesh looks as meant with interpolated normals.
+    """Whether a mesh should be shaded with interpolated normals.
 
-    A mesh with normals of its own does; one with face colours cannot. Otherwise the file decides (an OBJ's
-    smoothing groups), and last how many of its edges are sharper than CREASE: hard things stay hard.
+    A mesh with its own normals is, one with face colours is not. Otherwise the file decides (smoothing groups of an
+    OBJ), and finally the number of edges sharper than CREASE.
     """
     if visual_of(mesh).kind == "face":
         return False
@@ -102,10 +102,10 @@ def is_smooth(mesh: trimesh.Trimesh) -> bool:
 
 
 def smooth_normals(mesh: trimesh.Trimesh) -> npt.NDArray[np.float64] | None:
-    """Normals `(vertex, 3)` of a mesh without its own, the same on both sides of a seam of its texture.
+    """Normals `(vertex, 3)` of a mesh without its own, equal on both sides of texture seams.
 
     Returns:
-        The normals; None where the mesh has some, or has no seams.
+        The normals; None if the mesh has its own, or no seams.
     """
     if "vertex_normals" in mesh._cache.cache:
         return None
@@ -114,7 +114,7 @@ def smooth_normals(mesh: trimesh.Trimesh) -> npt.NDArray[np.float64] | None:
 
 
 def _welded(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, npt.NDArray[np.int64] | None]:
-    """A mesh without the seams of its texture, smoothing groups apart, and which of its vertices stand for the old."""
+    """A mesh with merged texture seams but separate smoothing groups, and the new index of each old vertex."""
     if not isinstance(mesh.visual, TextureVisuals) or mesh.visual.uv is None:
         return mesh, None
     groups = mesh.metadata.get("smoothing", np.zeros(len(mesh.vertices)))
@@ -127,11 +127,11 @@ def _welded(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, npt.NDArray[np.int6
 
 
 def decimate(parts: list[trimesh.Trimesh], max_faces: int) -> list[trimesh.Trimesh] | None:
-    """Simplify those parts whose looks survive it: of one colour, or coloured at the vertices.
+    """Simplify the parts that can be without damage: those of one colour, or with vertex colours.
 
     Args:
         parts: clean meshes.
-        max_faces: triangles at most, all together.
+        max_faces: most triangles in total.
 
     Returns:
         The parts with at most that many triangles, or None where textures or face colours forbid it.
@@ -185,7 +185,7 @@ def _degenerate(vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> npt.NDAr
 
 
 def _first_of_their_corners(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """The faces, in order, but for those that have the three vertices of an earlier one."""
+    """The faces, in order, without those that have the three vertices of an earlier one."""
     low, high = faces.min(axis=1, initial=0), faces.max(axis=1, initial=0)
     middle = faces.sum(axis=1) - low - high
     base = int(high.max(initial=0)) + 1
@@ -197,7 +197,7 @@ def _first_of_their_corners(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int6
 def _normals(
     mesh: trimesh.Trimesh, label: str, faces: npt.NDArray[Any], used: npt.NDArray[Any], warnings: list[str]
 ) -> npt.NDArray[np.float64] | None:
-    """Unit normals of the used vertices that agree with the winding, or None if the file has none."""
+    """Unit normals of the used vertices, consistent with the winding; None if the file has none."""
     if "vertex_normals" not in mesh._cache.cache:
         return None
     vertices = np.asarray(mesh.vertices, dtype=np.float64)

@@ -1,7 +1,7 @@
-"""Reads COLLADA files with pycollada and trimesh, after their XML has been brought into the form that both draw right.
+"""Reads COLLADA files with pycollada and trimesh, after converting their XML to a form that both handle correctly.
 
-trimesh leaves out what a controller deforms, and the geometry of every error that pycollada ignores; pycollada cuts all
-polygons into fans.
+trimesh omits geometry that a controller deforms or in which pycollada ignored an error; pycollada cuts all polygons
+into fans.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from data_gen.meshes.triangulate import concave, fan, triangulate
 
 __all__ = ["declared_up", "read_dae"]
 
-_LUMINANCE = (0.212671, 0.715160, 0.072169)  # of red, green and blue, as COLLADA has them
+_LUMINANCE = (0.212671, 0.715160, 0.072169)  # of red, green and blue, as COLLADA defines them
 
 _NOT_DRAWN = ("lines", "linestrips", "points", "spline", "brep", "convex_mesh")
 
@@ -30,10 +30,10 @@ def read_dae(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     """The geometries of a COLLADA file, factors of materials as in the file (sRGB), and warnings.
 
     Returns:
-        The scene, and warnings that name what is not drawn as the file states.
+        The scene, and warnings about what is not drawn as the file states.
 
     Raises:
-        MeshError: if it declares a document type, which COLLADA needs for nothing, or a number is NaN.
+        MeshError: if it declares a document type, which COLLADA never needs, or a number is NaN.
     """
     if re.search(rb"<!\s*(DOCTYPE|ENTITY)", data, re.IGNORECASE):
         raise MeshError(f"{folder.path}: expected plain COLLADA, found a document type or entity; export it again")
@@ -67,7 +67,7 @@ def declared_up(data: bytes) -> str | None:
 
 
 def _not_drawn(data: bytes) -> list[str]:
-    """What pycollada finds wrong and leaves out, and surfaces that let light through, which trimesh draws opaque."""
+    """Warnings about errors, which pycollada omits, and about translucent surfaces, which trimesh draws opaque."""
     import collada
     from collada.common import DaeError
 
@@ -81,7 +81,7 @@ def _not_drawn(data: bytes) -> list[str]:
 
 
 def _opacity(effect: Any) -> float:
-    """That of a plain colour ("Determining Transparency" in the specification of COLLADA 1.4.1)."""
+    """Opacity of a plain colour ("Determining Transparency" in the specification of COLLADA 1.4.1)."""
     share = effect.transparency if isinstance(effect.transparency, (int, float)) else 1.0
     through = effect.transparent if isinstance(effect.transparent, (tuple, list)) else None
     if str(effect.opaque_mode) == "RGB_ZERO":
@@ -90,7 +90,7 @@ def _opacity(effect: Any) -> float:
 
 
 def _without_controllers(root: ElementTree.Element, namespace: str, warnings: list[str]) -> int:
-    """Put the geometry that a controller deforms in its place, and return how often."""
+    """Replace controllers by the geometry that they deform, and return how many."""
     sources: dict[str, str] = {}
     for controller in root.iter(f"{namespace}controller"):
         for kind in ("skin", "morph"):
@@ -100,7 +100,7 @@ def _without_controllers(root: ElementTree.Element, namespace: str, warnings: li
     count = 0
     for instance in root.iter(f"{namespace}instance_controller"):
         url = instance.get("url", "")
-        for _ in range(len(sources)):  # of a skin of a morph of a geometry
+        for _ in range(len(sources)):  # such as a skin of a morph of a geometry
             url = sources.get(url, url)
         instance.tag = f"{namespace}instance_geometry"
         instance.set("url", url)
@@ -115,7 +115,7 @@ def _without_controllers(root: ElementTree.Element, namespace: str, warnings: li
 
 
 def _without_concave_polygons(root: ElementTree.Element, namespace: str) -> int:
-    """Write the sets of polygons that hold concave ones as triangles, and return how many sets."""
+    """Rewrite sets of polygons that contain concave ones as triangles, and return how many sets."""
     count = 0
     for mesh in root.iter(f"{namespace}mesh"):
         for polygons in [*mesh.findall(f"{namespace}polylist"), *mesh.findall(f"{namespace}polygons")]:
@@ -125,7 +125,7 @@ def _without_concave_polygons(root: ElementTree.Element, namespace: str) -> int:
             points = _positions(mesh, namespace, inputs)
             offset = next((int(each.get("offset", 0)) for each in inputs if each.get("semantic") == "VERTEX"), 0)
             if points is None or sizes.min(initial=3) < 3 or sizes.sum() != len(index):
-                continue  # as pycollada finds and says, too
+                continue  # pycollada reports it, too
             if len(index) and not 0 <= index[:, offset].min() <= index[:, offset].max() < len(points):
                 continue
             triangles = _triangles(sizes, points[index[:, offset]])
@@ -156,7 +156,7 @@ def _indices(
 
 
 def _positions(mesh: ElementTree.Element, namespace: str, inputs: list[Any]) -> npt.NDArray[np.float64] | None:
-    """The vertices (vertex, 3) of a mesh; None where they are not given as three plain numbers each."""
+    """The vertices (vertex, 3) of a mesh; None if they are not three plain numbers each."""
     position = mesh.find(f"{namespace}vertices/{namespace}input[@semantic='POSITION']")
     if position is None or not any(each.get("semantic") == "VERTEX" for each in inputs):
         return None
@@ -172,7 +172,7 @@ def _positions(mesh: ElementTree.Element, namespace: str, inputs: list[Any]) -> 
 
 
 def _triangles(sizes: npt.NDArray[np.int64], corners: npt.NDArray[np.float64]) -> npt.NDArray[np.int64] | None:
-    """Corner numbers (triangle, 3) of polygons whose corners follow each other; None where none is concave."""
+    """Corner indices (triangle, 3) of polygons with consecutive corners; None if none is concave."""
     starts = np.cumsum(sizes) - sizes
     is_concave = np.zeros(len(sizes), dtype=bool)
     for size in np.unique(sizes[sizes > 3]):

@@ -1,4 +1,4 @@
-"""What may be read of a mesh's files: which kinds, how many bytes, how many pixels; and the error for what may not.
+"""Limits on the files of a mesh (formats, bytes, pixels), and the error for meshes that are refused.
 
 Sizes are checked before a file is read, pixels before they are decoded.
 """
@@ -34,25 +34,25 @@ OTHER_SUFFIXES = (
     *(".3ds", ".3mf", ".abc", ".blend", ".c4d", ".fbx", ".lwo", ".ma", ".max", ".mb", ".skp", ".stp", ".step"),
     *(".usd", ".usda", ".usdc", ".usdz", ".vrm", ".wrl", ".x3d"),
 )
-"""Endings of mesh files that are not read, lower case."""
+"""Endings of unsupported mesh files, lower case."""
 
 STATES_ITS_AXIS = (".glb", ".gltf", ".dae")
-"""Endings of formats that say which axis points up: glTF y, by its specification, COLLADA in the file."""
+"""Endings of formats that define the up axis: glTF y, by its specification, COLLADA in the file."""
 
 MAX_FILE_BYTES = 1 << 30
-"""Bytes of one file that are read at most."""
+"""Most bytes of one file."""
 
 MAX_TEXT_BYTES = 1 << 28
-"""Bytes of a file of text (OBJ, MTL, OFF, DAE) at most: it takes about twenty times as many in memory."""
+"""Most bytes of a text file (OBJ, MTL, OFF, DAE), which takes about twenty times as many in memory."""
 
 MAX_PIXELS = 1 << 26
-"""Pixels of all textures of a model that are decoded at most: one of 8192 x 8192."""
+"""Most pixels of all textures of a model, decoded: 8192 x 8192."""
 
 MAX_PARTS = 20_000
-"""Parts of a mesh at most: primitives times the nodes and instances that place them. A part takes about 2 ms."""
+"""Most parts of a mesh: primitives times the nodes and instances that place them. A part takes about 2 ms."""
 
 IMAGE_FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "TGA", "WEBP", "PPM", "DDS", "JPEG2000")
-"""Formats of textures that are decoded, as pillow names them; none of them runs a program."""
+"""Texture formats that are decoded, by Pillow's names; none of them starts a program."""
 
 
 class MeshError(ValueError):
@@ -82,14 +82,14 @@ def read_bytes(path: Path, *, limit: int) -> bytes:
 
 
 def check_image(data: bytes, name: str, *, limit: int) -> int:
-    """Decode an image of at most `limit` pixels, after its size was checked, to see that it is whole.
+    """Check that an image is intact by decoding it, after checking its size.
 
     Returns:
         Its number of pixels.
 
     Raises:
         MeshError: if it has more pixels than allowed.
-        ValueError: if it is no image, or cut short.
+        ValueError: if it is not an image, or cut short.
     """
     try:
         with warnings.catch_warnings():

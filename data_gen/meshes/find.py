@@ -17,23 +17,23 @@ from hyperplanes.utilities.encoding import sha256
 __all__ = ["FoundMeshes", "MeshFile", "find_meshes", "safe_name"]
 
 _BEST_FIRST = (".glb", ".gltf", ".obj", ".dae", ".ply", ".off", ".stl")
-"""Formats by how much they hold of what an object looks like; of an object in several the first is taken."""
+"""Formats in order of how much of an object's look they store; of an object in several, the first is taken."""
 
 _FORMATS = "|".join(suffix.removeprefix(".") for suffix in (*MESH_SUFFIXES, *OTHER_SUFFIXES))
 _NAMES_A_FORMAT = re.compile(
     rf"({_FORMATS}|collada|blender)s?([\W_]*(binary|draco|embedded|files?|formats?|mesh(es)?|models?|quantized))*", re.I
 )
-"""Folders of packs of objects: `OBJ format`, `glTF-Binary`, `FBX`, `Blends`."""
+"""Names of folders in packs of objects: `OBJ format`, `glTF-Binary`, `FBX`, `Blends`."""
 
 _SAME_FORMAT = {"glb": "gltf", "collada": "dae", "blender": "blend"}
 
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh file that was found.
+    """A mesh file.
 
     Attributes:
-        name: unique in its folder and safe as the name of a file on any system.
+        name: unique in its folder and safe as a file name on any system.
         path: the file.
         class_name: its class (`car`), if the tree states it.
         split: `train`, `val` or `test`, if the tree or its split file states it.
@@ -47,12 +47,12 @@ class MeshFile:
 
 @dataclass(frozen=True)
 class FoundMeshes:
-    """What a folder holds.
+    """The meshes of a folder.
 
     Attributes:
-        meshes: that can be read, sorted by name; one file an object.
-        unreadable: files of formats that are not read, those beside the models of a ShapeNetCore tree, and folders that
-            are not looked into, from the folder on, with the reason.
+        meshes: the readable ones, sorted by name; one file per object.
+        unreadable: files in unsupported formats, those beside the models of a ShapeNetCore tree, and folders that are
+            not searched, as relative paths with the reason.
         duplicates: files that hold the same object as one of `meshes` in another format, likewise.
     """
 
@@ -62,12 +62,12 @@ class FoundMeshes:
 
 
 def safe_name(text: str) -> str:
-    """Turn any text into the name of a file: letters, digits, dot, hyphen and underscore, at most 100 of them.
+    """Turn any text into a file name of at most 100 ASCII letters, digits, dots, hyphens and underscores.
 
-    Other letters can be shown by few fonts, those of our contact sheets and of matplotlib not among them.
+    Few fonts have other letters; those of our contact sheets and of matplotlib do not.
 
     Returns:
-        The name, `mesh` if nothing of the text is left; with a checksum of the text where letters are lost.
+        The name; `mesh` if nothing is left, with a checksum of the text where letters are lost.
 
     >>> safe_name("Tisch & Stühle/2.glb")
     'Tisch_Stuhle_2.glb'
@@ -91,18 +91,19 @@ def find_meshes(
     """List the meshes under a folder.
 
     A ShapeNetCore tree (or one class of it) gives `CLASS_ID` with class and split: the official split if its file is
-    given or lies in the folder as `all.csv` (a model that it does not list has none), else that of the paper. Any
-    other folder gives every mesh file at any depth, named by its path, without class and split, but for hidden files.
-    Files of one name beside each other, or in folders that are named after formats, are one object, of which the best
-    is taken. Links are followed, to each folder once.
+    given or is the folder's `all.csv` (models that it does not list have none), else that of the paper. Any other
+    folder gives every mesh file at any depth except hidden ones, named by its path, without class and split. Files of
+    the same name beside each other, or in folders named after formats, are one object, of which the best file is
+    taken. Links are followed, to each folder once.
 
     Args:
         folder: the folder.
         split_file: ShapeNet's official `all.csv`.
-        reason_against: says why not to look into a folder below; None to do so, nothing where none need know of it.
+        reason_against: gives the reason not to search a subfolder: None to search it, an empty string to skip it
+            silently.
 
     Returns:
-        The meshes, their names unique even where case does not count, and what is left out.
+        The meshes, with names that are unique even without regard to case, and what is left out.
 
     Raises:
         MeshError: if the folder is absent or holds no mesh, or the split file cannot be read.
@@ -124,7 +125,7 @@ def find_meshes(
     plain = {path for path in files if not _object_of(path)[1]}
     for path in files:
         place, _ = _object_of(path)
-        # in the folder of its format and beside that, too: two objects
+        # both in the folder of its format and beside that: two objects
         twice = path not in plain and Path(*place[:-1], place[-1] + path.suffix) in plain
         objects[path.parts if twice else place].append(path)
     taken, duplicates = [], []
@@ -143,9 +144,9 @@ def find_meshes(
 
 
 def _mesh_files(root: Path, reason_against: Callable[[Path], str | None]) -> tuple[list[Path], list[tuple[str, str]]]:
-    """The mesh files under a folder but those that are hidden, from it on, sorted, and folders that are left out.
+    """Relative paths of the mesh files under a folder except hidden ones, sorted, and folders that are left out.
 
-    Each folder is looked into once: where it lies if that is under the root, else by the first link that leads to it.
+    Each folder is searched once: in its place if that is under the root, else through the first link to it.
     """
     found, left_out = [], []
     folders, links, seen = [Path()], [], set()
@@ -179,7 +180,7 @@ def _mesh_files(root: Path, reason_against: Callable[[Path], str | None]) -> tup
 
 
 def _object_of(path: Path) -> tuple[tuple[str, ...], bool]:
-    """What files of one object have in common, and whether this one lies in a folder that is named after its format."""
+    """A key shared by the files of one object, and whether this file lies in a folder named after its format."""
 
     def format_of(name: str) -> str:
         return _SAME_FORMAT.get(name.lower(), name.lower())
@@ -217,7 +218,7 @@ def _shapenet(
 
 
 def _unique(found: Iterable[MeshFile]) -> list[MeshFile]:
-    """Give equal names (also equal but for case) a number, and sort."""
+    """Append numbers to names that are equal without regard to case, and sort."""
     taken: set[str] = set()
     unique = []
     for mesh in found:

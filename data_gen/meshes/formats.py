@@ -1,8 +1,8 @@
 """Reads PLY and STL files with trimesh, after checks, and OFF files without it.
 
-Each check compares the length of the file with what its header declares. trimesh alone loads, without a warning, an
-ASCII PLY that was cut at 24 of 233 places, an ASCII STL at 5 of 440 and an OFF at 24 of 89, with faces missing, and
-drops the colours of an OFF file, of its vertices and faces alike.
+Each check compares the length of the file with its header. trimesh alone loads an ASCII PLY cut at 24 of 233 places, an
+ASCII STL at 5 of 440 and an OFF at 24 of 89, without a warning and with faces missing, and drops the vertex and face
+colours of OFF files.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def read_stl(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
 
 
 def _check_stl(data: bytes, folder: ModelFolder) -> tuple[bytes, list[str]]:
-    """The file without what stands behind its last triangle, and warnings."""
+    """The file without bytes behind its last triangle, and warnings."""
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else 0
     spare = len(data) - 84 - 50 * count
     text = b"" if spare == 0 else data.lower()
@@ -61,7 +61,7 @@ def _check_stl(data: bytes, folder: ModelFolder) -> tuple[bytes, list[str]]:
 
 
 def _check_ply(data: bytes, folder: ModelFolder) -> tuple[int, int, list[str]]:
-    """Vertices and faces that the header declares and the file can hold, and warnings."""
+    """Numbers of vertices and faces in the header, checked against the size of the file, and warnings."""
     head, mark, body = data.partition(b"end_header")
     if not data.startswith(b"ply") or not mark:
         raise MeshError(f"{folder.path}: expected a PLY header to end_header, found none; fetch it again")
@@ -85,7 +85,7 @@ def _check_ply(data: bytes, folder: ModelFolder) -> tuple[int, int, list[str]]:
 
 
 def _fixed_bytes(header: str, counts: dict[str, int]) -> int:
-    """The fewest bytes that the elements of a binary PLY file take, a list of three indices a face."""
+    """The fewest bytes that the elements of a binary PLY file take, with three indices per face."""
     need, element = 0, ""
     for words in (line.split() for line in header.splitlines()):
         if words[:1] == ["element"]:
@@ -101,8 +101,8 @@ def _fixed_bytes(header: str, counts: dict[str, int]) -> int:
 def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
     """The geometry of a PLY file, and warnings.
 
-    trimesh cuts every polygon into a fan and gives each triangle the colour of the polygon of its own number, draws
-    coordinates without a texture dark, and takes the lower 8 bits of colours of 16.
+    trimesh cuts every polygon into a fan, gives each triangle the colour of the polygon with the same index, draws
+    texture coordinates without a texture dark, and takes the lower 8 bits of 16-bit colours.
 
     Raises:
         MeshError: if it was cut or holds no faces.
@@ -112,7 +112,7 @@ def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
         raise MeshError(f"{folder.path}: expected faces, found {vertices} points only; make a surface of them first")
     loaded = load_ply(io.BytesIO(data), resolver=folder)
     elements = loaded["metadata"].pop("_ply_raw")
-    if loaded.pop("entities", None) is not None:  # edges, whose points take the place of the vertices
+    if loaded.pop("entities", None) is not None:  # edges, whose points replaced the vertices
         loaded["vertices"] = np.column_stack([elements["vertex"]["data"][axis] for axis in "xyz"])
     for name, keyword in (("vertex", "vertex_colors"), ("face", "face_colors")):
         if loaded.get(keyword) is not None:
@@ -136,13 +136,13 @@ def read_ply(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
 
 
 def _cut_polygons(loaded: dict[str, Any], elements: dict[str, Any], folder: ModelFolder) -> int:
-    """Cut the polygons of a PLY file anew where a fan is wrong, or each triangle needs the colour of its polygon.
+    """Triangulate the polygons of a PLY file where a fan is wrong, or triangles need the colour of their polygon.
 
     Returns:
-        How many faces have fewer than 3 corners.
+        The number of faces with fewer than 3 corners.
 
     Raises:
-        MeshError: if a face refers to a vertex that is not there.
+        MeshError: if a face refers to a missing vertex.
     """
     polygons = _ply_polygons(elements.get("face", {}).get("data"))
     if polygons is None:
@@ -153,7 +153,7 @@ def _cut_polygons(loaded: dict[str, Any], elements: dict[str, Any], folder: Mode
     if small == len(sizes) or (sizes == 3).all():
         return small
     if len(vertices) != elements["vertex"]["length"]:
-        return small  # taken apart where its texture has seams
+        return small  # split at the seams of its texture
     starts = np.cumsum(np.maximum(sizes - 2, 0)) - np.maximum(sizes - 2, 0)
     fans = [np.asarray(polygon, dtype=np.int64)[fan(len(polygon))] for polygon in polygons if len(polygon) > 2]
     triangles = np.concatenate(fans)
@@ -175,7 +175,7 @@ def _cut_polygons(loaded: dict[str, Any], elements: dict[str, Any], folder: Mode
 
 
 def _ply_polygons(data: Any) -> Any:
-    """The vertex indices of each face, as trimesh read them; None where there are none."""
+    """The vertex indices of each face, as read by trimesh; None if there are none."""
     names = ("vertex_indices", "vertex_index")
     if isinstance(data, dict):
         return next((data[name] for name in names if name in data), None)
@@ -186,7 +186,7 @@ def _ply_polygons(data: Any) -> Any:
 
 
 def read_off(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]]:
-    """The geometry of an OFF file with the colours of its vertices (COFF) or faces; and warnings."""
+    """The geometry of an OFF file with vertex (COFF) or face colours, and warnings."""
     warnings = [] if data.endswith((b"\n", b"\r")) else [_CUT]
     lines = [line.partition("#")[0].split() for line in decode_text(data).splitlines()]
     lines = [line for line in lines if line]
@@ -268,9 +268,9 @@ def _colours(colours: npt.NDArray[Any], alpha: npt.NDArray[Any] | None) -> npt.N
 
 
 def _of_255(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Values of 255. Floating-point ones are of 1, or of 255 where any is above; integers of what their type can hold.
+    """Values scaled to 0 to 255: floats from 1, or from 255 if any is above 1; integers from the largest of their type.
 
-    Integers that are all up to 255 are of 255: many a program writes them into wider types.
+    Integers of at most 255 are not scaled: many programs write them in wider types.
     """
     values = np.where(np.isfinite(values), values, 0)
     largest = values.max(initial=0)

@@ -1,8 +1,8 @@
-"""Colours, textures and materials of a mesh, brought into the few forms that every renderer draws alike.
+"""Colours, textures and materials of a mesh, converted to the few forms that all renderers draw alike.
 
 After `canonical_visual` a mesh has vertex colours, face colours, or a `PBRMaterial` whose base texture is RGB or
-RGBA and has coordinates. Textures, vertex and face colours are sRGB, the factors of materials LINEAR, and so are
-vertex colours that multiply a material.
+RGBA and has coordinates. Textures, vertex and face colours are sRGB; factors of materials and vertex colours that
+multiply a material are LINEAR.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ __all__ = [
 ]
 
 ColourSpace = Literal["scene", "gltf", "srgb"]
-"""What plain colours are before: `scene` as they are after, `gltf` linear on top of materials, too, `srgb` all sRGB."""
+"""Colour space of plain colours before: `scene` as after, `gltf` also linear on top of materials, `srgb` all sRGB."""
 
 DEFAULT_COLOUR = (0.6, 0.6, 0.6, 1.0)
-"""Linear RGBA of a surface without a colour: a light grey."""
+"""Linear RGBA of a surface without colour: a light grey."""
 
 VERTEX_COLOUR, LINEAR_COLOUR, EMISSIVE_UV = "color", "linear_colour", "emissive_uv"
-"""Vertex attributes of a TextureVisuals: colours on top of its material, as the file has them and, in a canonical
-visual, as linear RGBA in [0, 1]; coordinates of its emissive texture where they are not those of the base colour."""
+"""Vertex attributes of a TextureVisuals: colours on top of its material, as in the file and, in a canonical visual, as
+linear RGBA in [0, 1]; coordinates of its emissive texture if they differ from those of the base colour."""
 
 _MAP_SLOTS = ("metallicRoughnessTexture", "normalTexture", "occlusionTexture", "emissiveTexture")
 
@@ -60,10 +60,10 @@ Wrap = Literal["repeat", "clamp", "mirror"]
 
 
 class DrawnMaterial(PBRMaterial):
-    """A PBRMaterial with what glTF states and that class has no field for.
+    """A PBRMaterial with glTF properties for which that class has no field.
 
     Attributes:
-        unlit: whether its base colour is seen as it is, whatever the light.
+        unlit: whether its base colour is shown without lighting.
         wrap: wrap mode of its base colour texture along u and along v.
         emissive_wrap: that of its emissive texture.
     """
@@ -73,20 +73,20 @@ class DrawnMaterial(PBRMaterial):
     emissive_wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
 
     def with_fields_of(self, other: Material) -> Self:
-        """Take the attributes above from another material, and return itself."""
+        """Copy the attributes above from another material, and return itself."""
         if isinstance(other, DrawnMaterial):
             self.unlit, self.wrap, self.emissive_wrap = other.unlit, other.wrap, other.emissive_wrap
         return self
 
 
 class LinearMaterial(DrawnMaterial):
-    """A PBRMaterial that also keeps its linear base colour in float.
+    """A PBRMaterial that also keeps its linear base colour as floats.
 
-    trimesh rounds it to 8 bits, whose steps are up to 13 of 255 apart in sRGB, where it is dark.
+    trimesh rounds it to 8 bits, whose steps are up to 13 of 255 in sRGB for dark colours.
 
     Args:
         baseColorFactor: linear RGBA in [0, 1].
-        **values: the others of a PBRMaterial.
+        **values: other arguments of a PBRMaterial.
     """
 
     def __init__(self, *, baseColorFactor: npt.ArrayLike, **values: Any) -> None:
@@ -94,19 +94,19 @@ class LinearMaterial(DrawnMaterial):
         super().__init__(baseColorFactor=self.exact.copy(), **values)
 
     def copy(self) -> LinearMaterial:
-        """Another one with the same values; pictures are shared."""
+        """A copy with the same values; images are shared."""
         return LinearMaterial(**{**self._data, "baseColorFactor": linear_factor(self)}).with_fields_of(self)
 
 
 def linear_factor(material: PBRMaterial) -> npt.NDArray[np.float64] | None:
-    """Linear RGBA in [0, 1] of a material, as exactly as it is known; None where it states none."""
+    """Linear RGBA in [0, 1] of a material, as exactly as known; None if it states none."""
     factor = material.baseColorFactor
     if factor is None:
         return None
     rounded = np.asarray(factor, dtype=np.float64) / 255.0
     if isinstance(material, LinearMaterial) and np.abs(material.exact - rounded).max() < 0.51 / 255.0:
         return material.exact.copy()
-    return rounded  # of another class, or set anew since
+    return rounded  # of another class, or changed since
 
 
 def linear_colours(colours: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -120,7 +120,7 @@ def linear_colours(colours: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def visual_of(mesh: trimesh.Trimesh) -> Visual:
-    """The colours or the texture of a mesh; colours that are not defined where it has neither.
+    """The colours or the texture of a mesh; undefined colours if it has neither.
 
     >>> visual_of(trimesh.Trimesh()).defined
     False
@@ -146,16 +146,16 @@ def select_vertices(visual: TextureVisuals, used: npt.NDArray[np.int64]) -> Text
 def canonical_visual(
     mesh: trimesh.Trimesh, label: str, *, colours: ColourSpace = "scene", images: dict[Any, Any] | None = None
 ) -> tuple[Any, list[str], bool]:
-    """Bring what colours a mesh into a form that every renderer draws alike.
+    """Convert the colours of a mesh to a form that all renderers draw alike.
 
     Args:
         mesh: the mesh, which is not changed.
-        label: what to call it in a warning.
-        colours: what its plain colours are.
+        label: its name in warnings.
+        colours: colour space of its plain colours.
         images: converted textures, shared between the meshes of a scene.
 
     Returns:
-        The visual, warnings that name what was lost, and whether the surface can be seen at all.
+        The visual, warnings about what was lost, and whether the surface is visible at all.
     """
     visual = visual_of(mesh)
     images = {} if images is None else images
@@ -236,7 +236,7 @@ def _glows(data: dict[str, Any]) -> bool:
 
 
 def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> None:
-    """A surface without coordinates takes the mean colour of its texture."""
+    """Replace textures without coordinates by their mean colour."""
     image = data.get("baseColorTexture")
     if image is not None:
         mean = np.asarray(image.convert("RGB"), dtype=np.float64).reshape(-1, 3).mean(axis=0)
@@ -251,7 +251,7 @@ def _drop_textures(data: dict[str, Any], label: str, warnings: list[str]) -> Non
 
 
 def _material_vertex_colours(visual: TextureVisuals, count: int) -> npt.NDArray[np.float64] | None:
-    """RGBA in [0, 1] of vertex colours that lie on top of a material, as they stand in the file."""
+    """RGBA in [0, 1] of vertex colours on top of a material, as in the file."""
     attribute = visual.vertex_attributes.get(VERTEX_COLOUR) if hasattr(visual, "vertex_attributes") else None
     if attribute is None or len(attribute) != count:
         return None
@@ -296,14 +296,14 @@ def _pbr_values(material: PBRMaterial, images: dict[Any, Any]) -> dict[str, Any]
 
 
 def pbr_of_mtl(material: SimpleMaterial, images: dict[Any, Any] | None = None) -> LinearMaterial:
-    """The material of an MTL file or a texture without one, as glTF would state it.
+    """The glTF equivalent of a material of an MTL file, or of a texture without one.
 
     Args:
-        material: its `diffuse` is sRGB; a texture takes its place, for programs write any colour beside one.
+        material: its `diffuse` is sRGB; a texture replaces it, since programs write any colour beside one.
         images: converted textures, shared between the meshes of a scene.
 
     Returns:
-        The material, its factor linear; a mirror exponent (Ns) gives the roughness.
+        The material, its factor linear; the specular exponent (Ns) gives the roughness.
     """
     image = _converted(material.image, "RGBA", {} if images is None else images)
     colour = np.asarray(material.diffuse, dtype=np.float64) / 255.0
@@ -319,31 +319,31 @@ def pbr_of_mtl(material: SimpleMaterial, images: dict[Any, Any] | None = None) -
 
 
 def roughness_of_exponent(exponent: float) -> float:
-    """Roughness of a highlight that falls off as the cosine to the power of `exponent` (Ns of an MTL file)."""
+    """Roughness of a highlight that falls off with the cosine to the power of `exponent` (Ns of an MTL file)."""
     return float((2.0 / (max(exponent, 0.0) + 2.0)) ** 0.25)
 
 
 def _converted(image: PIL.Image.Image | None, mode: str, images: dict[Any, Any]) -> PIL.Image.Image | None:
-    """An image of 8 bits a channel: RGB, or RGBA where alpha is wanted and there is some."""
+    """An image with 8 bits per channel: RGB, or RGBA if alpha is wanted and present."""
     if image is None:
         return None
     key = (id(image), mode)
     if key not in images:
-        images[key] = (convert_image(image, mode), image)  # the source too: its id must not be given to another
+        images[key] = (convert_image(image, mode), image)  # keep the source, so that its id is not reused
     return images[key][0]
 
 
 def convert_image(image: PIL.Image.Image, mode: str) -> PIL.Image.Image | None:
-    """An image of 8 bits a channel.
+    """An image with 8 bits per channel.
 
     Args:
-        image: as pillow opened it.
-        mode: RGB, or RGBA for RGB with alpha where the image has any.
+        image: as opened by Pillow.
+        mode: RGB, or RGBA for RGB with alpha if the image has any.
 
     Returns:
-        The image; None for one that cannot be decoded, of which the reader of the file has warned.
+        The image; None if it cannot be decoded, about which the reader of the file has warned.
     """
-    if image.format not in (None, "MPO", *IMAGE_FORMATS):  # JPEG with further pictures behind the first
+    if image.format not in (None, "MPO", *IMAGE_FORMATS):  # MPO: a JPEG with further pictures
         return None
     try:
         image.load()

@@ -1,8 +1,8 @@
 """Loads any mesh file: read, checked, turned y up, and normalised.
 
 World convention: y up, the centre of the bounding box at the origin, the vertex farthest from it at distance 1. Nothing
-is lost silently: what cannot be drawn as the file states is named in `Mesh.warnings`, what cannot be drawn at all is a
-`MeshError`.
+is lost silently: `Mesh.warnings` names everything that is not drawn as the file states, and a mesh that cannot be drawn
+at all is a `MeshError`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 MAX_FACES = 2_000_000
-"""A mesh of more triangles is decimated where the looks survive it, unless said otherwise; of 8 times more, refused."""
+"""Default limit of triangles: larger meshes are decimated if that does no damage, 8 times larger ones refused."""
 
 _DECIMATED_FROM = 8
 _OUTLIER = 30.0
@@ -47,13 +47,13 @@ class Mesh:
     """A mesh that can be drawn.
 
     Attributes:
-        name: its name, safe as the name of a file.
+        name: its name, safe as a file name.
         scene: its geometries in world coordinates (all node transforms are the identity), y up, normalised.
-        world_from_file: the similarity `(4, 4)` that took the file's coordinates here.
+        world_from_file: the similarity `(4, 4)` from the file's coordinates.
         warnings: what was lost or repaired, one line each.
-        face_count: triangles.
-        lost_files: textures and material libraries that it names and is drawn without.
-        made_of: checksums of its files, as `model_folder.model_checksums` gives them.
+        face_count: number of triangles.
+        lost_files: missing textures and material libraries.
+        made_of: checksums of its files, as in `model_folder.model_checksums`.
     """
 
     name: str
@@ -77,10 +77,10 @@ def load_mesh(
 
     Args:
         path: a GLB, glTF, OBJ, PLY, STL, OFF or DAE file.
-        up: the axis that points up in the file. By default y, but what a COLLADA file declares.
-        name: what to call it; the file's name by default.
+        up: the axis that points up in the file; by default y, or what a COLLADA file declares.
+        name: its name; the file's name by default.
         max_faces: more triangles are decimated to as many, or drawn as they are with a warning; 8 times more, refused.
-        within: the folder that no file which the mesh refers to may leave; the model's own by default.
+        within: the folder that must contain all files of the mesh; by default the model's own.
 
     Returns:
         The mesh.
@@ -126,26 +126,25 @@ def prepare_scene(
     source: str | None = None,
     closed: bool = False,
 ) -> Mesh:
-    """Check a scene and bring it into world coordinates; the scene itself is not changed.
+    """Check a scene and convert it to world coordinates; the scene itself is not changed.
 
     Args:
         scene: geometries and node transforms.
-        name: what to call the mesh.
+        name: name of the mesh.
         up: the axis that points up in the scene.
         max_faces: more triangles are decimated to as many, or drawn as they are with a warning; 8 times more, refused.
         colours: `scene`: vertex and face colours are sRGB, factors of materials linear; `gltf`: vertex colours on top
             of a material are linear, too; `srgb`: all are sRGB. Textures are always sRGB.
-        warnings: what is already known to be lost.
-        source: what messages begin with; the name by default.
-        closed: whether all of it is known to be watertight solids wound outwards, so that back faces are not
-            drawn.
+        warnings: earlier warnings.
+        source: start of messages; the name by default.
+        closed: whether all parts are watertight solids wound outwards, so that back faces are not drawn.
 
     Returns:
         The mesh.
 
     Raises:
         MeshError: if there is nothing to draw, or too much.
-        ValueError: if `up` is none of the two.
+        ValueError: if `up` is neither of the two.
     """
     if up not in ("y", "z"):
         raise ValueError(f"up: expected 'y' or 'z', received {up!r}")
@@ -185,7 +184,7 @@ def prepare_scene(
 
 
 def mesh_parts(mesh: Mesh) -> list[trimesh.Trimesh]:
-    """The parts of a mesh as `MeshRenderer.render` takes them: its geometries, by name."""
+    """The parts of a mesh for `MeshRenderer.render`: its geometries, ordered by name."""
     return [mesh.scene.geometry[name] for name in sorted(mesh.scene.geometry)]
 
 
@@ -206,12 +205,12 @@ def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:
 def _clean_parts(
     scene: trimesh.Scene, colours: ColourSpace, found: list[str], source: str
 ) -> tuple[list[trimesh.Trimesh], float]:
-    """Clean meshes in the file's axes, one a node that can be seen; and what their coordinates are multiplied by.
+    """Clean meshes in the file's axes, one for each visible node, and the scale of their coordinates.
 
-    trimesh's tolerances are absolute, so a mesh is cleaned at about unit size. A power of two rounds nothing.
+    trimesh's tolerances are absolute, so meshes are cleaned at about unit size. A power of two rounds nothing.
 
     Raises:
-        MeshError: if a face refers to a vertex that is not there.
+        MeshError: if a face refers to a missing vertex.
     """
     placed: list[tuple[str, trimesh.Trimesh, npt.NDArray[np.float64], Any]] = []
     images: dict[Any, Any] = {}
@@ -236,7 +235,7 @@ def _clean_parts(
     parts = []
     try:
         for label, geometry, _, _ in placed:
-            check_faces(geometry, label)  # of all, since each is compared with the others
+            check_faces(geometry, label)  # of all parts, since each is compared with the others
         scale = _power_of_two([(geometry, transform) for _, geometry, transform, _ in placed])
         factors = np.array([[scale], [scale], [scale], [1.0]])
         meshes = [_transformed(geometry, factors * transform, visual) for _, geometry, transform, visual in placed]
@@ -251,7 +250,7 @@ def _clean_parts(
 
 
 def _power_of_two(placed: list[tuple[trimesh.Trimesh, npt.NDArray[np.float64]]]) -> float:
-    """What brings the largest extent of all faces into [0.5, 1); 1 where there is none."""
+    """The power of two that scales the largest extent of all faces into [0.5, 1); 1 without faces."""
     corners = [np.zeros((0, 3))]
     for mesh, transform in placed:
         points = np.asarray(mesh.vertices, dtype=np.float64)[np.unique(mesh.faces)]
@@ -264,7 +263,7 @@ def _power_of_two(placed: list[tuple[trimesh.Trimesh, npt.NDArray[np.float64]]])
 
 
 def _transformed(mesh: trimesh.Trimesh, transform: npt.NDArray[np.float64], visual: Any = None) -> trimesh.Trimesh:
-    """A copy in the coordinates that the transform leads to; a mirroring one also turns the faces around."""
+    """A transformed copy; mirroring transforms also reverse the faces."""
     linear = transform[:3, :3]
     vertices = np.asarray(mesh.vertices, dtype=np.float64) @ linear.T + transform[:3, 3]
     faces = np.asarray(mesh.faces)[:, ::-1] if np.linalg.det(linear) < 0 else np.asarray(mesh.faces)

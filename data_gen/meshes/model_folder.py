@@ -1,7 +1,7 @@
-"""The folder of one model: gives a mesh loader its materials, textures and buffers, and nothing else.
+"""The folder of one model: gives a mesh loader its materials, textures and buffers, and no other files.
 
-Every name in a mesh file is resolved here. Nothing outside the folder that was given is opened, and never the network.
-trimesh's FilePathResolver drops ShapeNet's `../images/x.jpg` without a warning, or is allowed to open any file.
+All names in a mesh file are resolved here. Nothing outside the given folder, and nothing from the network, is opened.
+trimesh's FilePathResolver drops ShapeNet's `../images/x.jpg` without a warning, or may open any file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hyperplanes.utilities.encoding import sha256
 __all__ = ["MAX_REFERENCES", "ModelFolder", "model_checksums", "model_root", "without_comment"]
 
 MAX_REFERENCES = 2000
-"""Different names of other files in a mesh at most. One that is not there takes about 1 ms to look for."""
+"""Most different names of other files in a mesh. Looking for a missing one takes about 1 ms."""
 
 _CODE_PAGES = ("cp1252", "cp437", "cp932", "gb18030", "cp1251")
 
@@ -33,7 +33,7 @@ _MTL_OPTION = re.compile(
 
 
 def without_comment(name: str) -> str:
-    """A name in a text file without what follows a # behind a space, which names may hold, too.
+    """A name in a text file without a comment: a # after a space and what follows. Names may contain # otherwise.
 
     >>> without_comment("wood.png # the floor"), without_comment("C#4")
     ('wood.png', 'C#4')
@@ -45,8 +45,8 @@ def model_root(path: Path) -> Path:
     """The folder that holds all files of a model.
 
     Returns:
-        That of the ID for ShapeNet's `ID/models/model_normalized.obj`, whose textures are in `ID/images`; that of NAME
-        for Gazebo's `NAME/meshes/x.dae` where there is a `NAME/materials`; else the file's.
+        `ID` for ShapeNet's `ID/models/model_normalized.obj`, whose textures are in `ID/images`; `NAME` for Gazebo's
+        `NAME/meshes/x.dae` if there is a `NAME/materials`; else the folder of the file.
     """
     folder = path.parent.resolve()
     of_shapenet = (folder.name, path.name) == ("models", "model_normalized.obj")
@@ -55,16 +55,16 @@ def model_root(path: Path) -> Path:
 
 
 def model_checksums(path: Path, names: Iterable[str], within: Path | None = None) -> dict[str, str | None]:
-    """What a model is made of, without reading what its files say.
+    """Checksums of the files of a model, without parsing them.
 
     Args:
         path: the mesh file.
-        names: of other files, as the mesh refers to them; that of the mesh file itself may be among them.
+        names: of other files, as the mesh refers to them; may include that of the mesh file itself.
         within: as in `ModelFolder`.
 
     Returns:
-        The checksum of the mesh by the file's name, and of the file that each name refers to, None where there is none.
-        Nothing of a model that would be refused.
+        The checksums of the mesh, by its file name, and of the file that each name refers to, None for missing files.
+        Empty for a model that would be refused.
     """
     try:
         others = ModelFolder(path, within).checksums(name for name in names if name != path.name)
@@ -74,23 +74,23 @@ def model_checksums(path: Path, names: Iterable[str], within: Path | None = None
 
 
 class ModelFolder(Resolver):
-    """Gives a mesh loader the other files of its model, from one folder and no other place.
+    """Gives a mesh loader the other files of its model, from one folder only.
 
-    Names are accepted as files hold them: with backslashes, percent-encoded, in the wrong case, behind MTL options
-    (`-s 1 1 1 wood.png`), before comments, or as `model://NAME/rest`, for which a folder NAME is looked for, and the
-    model's own stands in. What is not where its name says is looked for by the last part of it, as Blender does: beside
-    the mesh, and in the folders that usually hold textures. That is noted.
+    Names are accepted as they occur in files: with backslashes, percent-encoded, in the wrong case, behind MTL options
+    (`-s 1 1 1 wood.png`), before comments, or as `model://NAME/rest`, which refers to a folder NAME, or else to the
+    model's own. A missing file is looked for by the last part of its name, as in Blender: beside the mesh, and in the
+    folders that usually hold textures. That is noted.
 
     Args:
-        path: the mesh file; its name is what messages begin with.
-        within: the folder that nothing may leave; `model_root(path)` by default, and where the file is not in it.
+        path: the mesh file; messages begin with its name.
+        within: the folder that must contain all files; `model_root(path)` by default, and if the file is not in it.
 
-    A file that is not there, and a texture that cannot be decoded, is a FileNotFoundError and noted in `lost`.
+    A missing file, or a texture that cannot be decoded, is a FileNotFoundError and noted in `lost`.
 
     Attributes:
         lost: why each requested name could not be opened.
-        notes: what a user should know about names that could be given.
-        refused: the first reason to refuse the whole model, if there was one: loaders swallow exceptions.
+        notes: remarks for the user about names that were found elsewhere.
+        refused: the first reason to refuse the whole model, if any, since loaders swallow exceptions.
     """
 
     def __init__(self, path: Path, within: Path | None = None) -> None:
@@ -109,15 +109,15 @@ class ModelFolder(Resolver):
         self._images: set[Path] = set()
 
     def get(self, name: str) -> bytes:
-        """Give a loader the content of a file: one that was read before, or a texture."""
+        """The content of a file for a loader: one that was read before, or a texture."""
         found = self._find(name)
         return self._bytes[found] if found in self._bytes else self.get_image(name)
 
     def read(self, name: str, *, limit: int = MAX_FILE_BYTES) -> bytes:
-        """The content of a file of the model that is no texture, of at most `limit` bytes.
+        """The content of a file of the model other than a texture, of at most `limit` bytes.
 
         Raises:
-            FileNotFoundError: if there is no such file, or it is empty; noted in `lost`.
+            FileNotFoundError: if the file is missing or empty; noted in `lost`.
             MeshError: if it lies outside the model's folder or is too large; noted in `refused`.
         """
         found = self._find(name)
@@ -133,7 +133,7 @@ class ModelFolder(Resolver):
         return self._bytes[found]
 
     def get_image(self, name: str) -> bytes:
-        """The content of a texture of the model, which is decoded once to see that it is whole."""
+        """The content of a texture of the model, decoded once to check that it is intact."""
         found = self._find(name)
         if found not in self._images:
             self.count_pixels(self.read(name), name)
@@ -171,7 +171,7 @@ class ModelFolder(Resolver):
     def locate(self, name: str) -> Path | None:
         """Find a file of the model without reading it.
 
-        What an absolute path names is never opened; a file of its name beside the mesh is.
+        Absolute paths are never opened; a file of that name beside the mesh is.
 
         Returns:
             The file, or None if there is none.
@@ -189,10 +189,10 @@ class ModelFolder(Resolver):
         return self._places[name]
 
     def checksums(self, names: Iterable[str] | None = None) -> dict[str, str | None]:
-        """The checksum of the file that each name refers to, None where there is none.
+        """The checksum of the file that each name refers to, None for missing files.
 
         Args:
-            names: how the mesh refers to files; those that were asked for until now when None.
+            names: how the mesh refers to files; all names requested so far when None.
         """
         places = {name: self.locate(name) for name in (list(self._places) if names is None else names)}
         return {
@@ -225,7 +225,7 @@ class ModelFolder(Resolver):
         return None
 
     def _of_named_model(self, name: str) -> Iterator[Path]:
-        """Where a file of `model://NAME/rest` is if there is a folder NAME above the mesh, or beside one of those."""
+        """Possible places of `model://NAME/rest`: in a folder NAME above the mesh, or beside one of those."""
         parts = name.partition("://")[2].split("/")
         if not name.startswith("model://") or len(parts) < 2 or parts[0] in ("", ".", ".."):
             return
@@ -238,7 +238,7 @@ class ModelFolder(Resolver):
 
     @cached_property
     def _usual_folders(self) -> list[Path]:
-        """Those that there are: a mesh may name thousands of textures."""
+        """Those that exist, listed once: a mesh may name thousands of textures."""
         names = ("", "textures", "texture", "images", "maps", "materials/textures")
         places = dict.fromkeys((self.folder, model_root(self.path)))
         return [folder / name for folder in places for name in names if os.path.isdir(folder / name)]
@@ -250,7 +250,7 @@ class ModelFolder(Resolver):
             return False
 
     def _file(self, place: Path) -> Path | None:
-        """The file at a place inside the root, or one of a name that differs in case; None if there is none."""
+        """The file at a place inside the root, or one whose name differs in case; None if there is none."""
         try:
             path = place.resolve()
             if not path.is_relative_to(self.root):
@@ -277,16 +277,16 @@ class ModelFolder(Resolver):
         yield from sorted(entry.name for entry in self.folder.iterdir())
 
     def write(self, name: str, data: str | bytes) -> None:
-        """Raise a PermissionError: a model is only read."""
+        """Raise a PermissionError: models are read-only."""
         raise PermissionError(f"{name}: the folder of a model is only read")
 
     def namespaced(self, namespace: str) -> ModelFolder:
-        """The same folder: names keep their meaning."""
+        """The same folder, since names do not change."""
         return self
 
 
 def _candidates(name: str) -> Iterator[str]:
-    """Relative paths that a name may stand for, likeliest first."""
+    """Relative paths that a name may mean, most likely first."""
     uri = re.match(r"^(?:model|package|file)://(.*)$", name)
     if uri:
         parts = [part for part in uri.group(1).split("/") if part]
@@ -307,7 +307,7 @@ def _candidates(name: str) -> Iterator[str]:
 
 
 def _other_code_pages(name: str) -> Iterator[str]:
-    """What a name that was read as Latin-1 is in the code pages of other systems."""
+    """A name that was read as Latin-1, in the code pages of other systems."""
     if name.isascii():
         return
     for page in _CODE_PAGES:
@@ -318,7 +318,7 @@ def _other_code_pages(name: str) -> Iterator[str]:
 
 
 def _plain_case(name: str) -> str:
-    """A name without what differs between file systems: case, and how accents are encoded."""
+    """A name without differences between file systems: case and the encoding of accents."""
     return unicodedata.normalize("NFC", name).casefold()
 
 

@@ -3,13 +3,13 @@
 trimesh's reader drops opacity (`d`, `Tr`), emission, and textures behind options (`map_Kd -s 1 1 1 wood.png`). Of the
 options, those that move a texture (`-s`, `-o`) and `-clamp` are drawn.
 
-A texture takes the place of `Kd`, as in Blender and so in the pictures of ShapeNet: exporters write any Kd beside it.
-Opacity is that of `d` times that of `map_d` (its alpha where it has one, else its brightness), never the alpha of
-`map_Kd`; `Tr` is 1 - d where there is no d, but a lone `Tr 1` is what many programs write for opaque.
+A texture replaces `Kd`, as in Blender and thus in the pictures of ShapeNet: exporters write any Kd beside it. Opacity
+is that of `d` times that of `map_d` (its alpha if it has one, else its brightness), never the alpha of `map_Kd`; `Tr`
+is 1 - d where there is no d, but many programs write a lone `Tr 1` for opaque.
 
-`Kd` and `Ke` are sRGB, as the colours on their authors' screens were: 3ds Max writes its grey of 150/255 as 0.588. A
-ball of it in the studio light is 165 of 255 where it is brightest; read as linear, as Blender's importer does, it is
-209, and a dark 0.2 (51 of 255) comes out at up to 143 in place of 97.
+`Kd` and `Ke` are sRGB, like the colours on their authors' screens: 3ds Max writes its grey of 150/255 as 0.588. A ball
+of it in studio light has at most 165 of 255; read as linear, as by Blender's importer, it has 209, and a dark 0.2 (51
+of 255) becomes up to 143 instead of 97.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from hyperplanes.utilities.colour import linear_from_srgb
 __all__ = ["MAX_LIBRARIES", "MtlMaterial", "decode_text", "find_material", "read_materials"]
 
 MAX_LIBRARIES = 1000
-"""Different material libraries of an OBJ file at most."""
+"""Most different material libraries of an OBJ file."""
 
 _MOVE = re.compile(r"(?:^|\s)-(s|o)((?:\s+[-+]?[\d.]+(?:[eE][-+]?\d+)?(?=\s)){1,3})")
 _CLAMP = re.compile(r"(?:^|\s)-clamp\s+on\s")
 
 
 class MtlMaterial(LinearMaterial):
-    """A LinearMaterial whose texture is scaled and moved.
+    """A LinearMaterial with a scale and an offset of its texture.
 
     Attributes:
         scale: factors `(2,)` of u and v.
-        offset: what is added then `(2,)`.
+        offset: added afterwards `(2,)`.
     """
 
     scale: tuple[float, float] = (1.0, 1.0)
@@ -49,7 +49,7 @@ class MtlMaterial(LinearMaterial):
 
 
 def decode_text(data: bytes) -> str:
-    """Text of a file that does not declare its encoding: UTF-16 with its mark, UTF-8, else Latin-1."""
+    """Text of a file without declared encoding: UTF-16 with a byte order mark, UTF-8, else Latin-1."""
     if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return data.decode("utf-16", errors="replace")
     try:
@@ -62,9 +62,9 @@ def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str
     """Read all material libraries of an OBJ file; the folder refuses what lies outside it.
 
     Args:
-        libraries: what stands after each `mtllib`: one name, which may hold spaces, or several.
+        libraries: the text after each `mtllib`: one name, possibly with spaces, or several.
         folder: gives the files.
-        warnings: receives what was lost, by name.
+        warnings: receives a line for everything that was lost.
 
     Returns:
         Materials by name, colours linear.
@@ -96,11 +96,11 @@ def find_material(name: str, materials: dict[str, MtlMaterial]) -> MtlMaterial |
     """The material that an OBJ file names.
 
     Args:
-        name: what stands after `usemtl`.
-        materials: by name. Comments may follow these names and that one, where there is none of the whole name.
+        name: the text after `usemtl`.
+        materials: by name. All these names may contain comments, which are ignored if the whole name is not found.
 
     Returns:
-        The material, or None if there is none, or several that differ in what may be a comment.
+        The material; None if there is none, or several that differ only in possible comments.
     """
     if name in materials:
         return materials[name]

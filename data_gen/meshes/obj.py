@@ -1,7 +1,7 @@
-"""Reads Wavefront OBJ files strictly: what a line says is drawn, warned about by name, or refused by its number.
+"""Reads Wavefront OBJ files strictly: every line is drawn, named in a warning, or refused by its number.
 
-trimesh's reader gives no warning when it loses texture coordinates, indented lines, the second material library or the
-last faces: of a tetrahedron cut at any of 144 places it loads 44 with faces missing, this one 2 (see the known limit).
+trimesh's reader silently loses texture coordinates, indented lines, the second material library or the last faces: of a
+tetrahedron cut at each of 144 places it loads 44 with faces missing, this one 2 (see the known limit).
 
 Known limit: a file cut exactly between two lines, after every vertex was used by some face, is a whole OBJ file.
 """
@@ -37,12 +37,12 @@ class _Group:
     """The faces of one material, smooth or not.
 
     Attributes:
-        smooth: whether the file wants interpolated normals; None where it does not say.
-        corners: the index of each different corner in the current smoothing group.
+        smooth: whether the file asks for interpolated normals; None if it does not say.
+        corners: the index of each distinct corner in the current smoothing group.
         rows: vertex, texture coordinate and normal of each corner, counted from 0, -1 for none.
-        smoothing: the smoothing group of each corner; normals are not interpolated across two of them.
-        triangles: corners, three a triangle; polygons as fans.
-        polygons: where the fan of each begins, and its corners.
+        smoothing: the smoothing group of each corner; normals are not interpolated across groups.
+        triangles: corners, three per triangle; polygons as fans.
+        polygons: the start of each fan, and its corners.
     """
 
     smooth: bool | None
@@ -55,7 +55,7 @@ class _Group:
     _corners: dict[int, dict[Any, int]] = field(default_factory=dict)
 
     def enter(self, number: int) -> _Group:
-        """Go on in a smoothing group."""
+        """Continue in a smoothing group."""
         self.number, self.corners = number, self._corners.setdefault(number, {})
         return self
 
@@ -64,12 +64,12 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
     """Read an OBJ file and the materials and textures that it names.
 
     Returns:
-        One geometry a material, in the file's coordinates; and warnings that name what was lost. Plain colours are
-        linear in materials and sRGB at vertices. `metadata["smooth"]` is what the file's smoothing groups say, and
+        One geometry per material, in the file's coordinates, and warnings about what was lost. Plain colours are linear
+        in materials and sRGB at vertices. `metadata["smooth"]` is what the file's smoothing groups ask for, and
         `metadata["smoothing"]` the group of each vertex.
 
     Raises:
-        MeshError: if a line cannot be understood, a face refers to a vertex that is not there, or there are no faces.
+        MeshError: if a line cannot be understood, a face refers to a missing vertex, or there are no faces.
     """
     text = decode_text(data)
     if "\r" in text:
@@ -132,7 +132,7 @@ def _lines(text: str) -> Any:
     for line in text.replace("\\\n", "\r").split("\n"):  # no other \r is left in the text
         number, following = following, following + 1 + line.count("\r")
         line = line.replace("\r", " ").strip()
-        if "#" in line and not line.startswith(_NAMES):  # a name may hold one
+        if "#" in line and not line.startswith(_NAMES):  # names may contain one
             line = line.partition("#")[0].rstrip()
         if line:
             yield number, line.replace("\t", " ") if "\t" in line else line
@@ -159,7 +159,7 @@ def _add_face(
 
 
 def _index(corner: str, group: _Group, rows: dict[str, list[str]], number: int, folder: ModelFolder) -> int:
-    """The number of a corner among the different ones of its group."""
+    """The index of a corner among the distinct ones of its group."""
     index = group.corners.get(corner)
     if index is None:
         try:
@@ -168,7 +168,7 @@ def _index(corner: str, group: _Group, rows: dict[str, list[str]], number: int, 
             raise MeshError(
                 f"{folder.path}: line {number}: expected a face corner like 1/2/3, found {corner!r}; repair the line"
             ) from None
-        key: Any = row if "-" in corner else corner  # what a negative number refers to depends on the line
+        key: Any = row if "-" in corner else corner  # negative numbers are relative to the line
         index = group.corners.setdefault(key, len(group.rows))
         if index == len(group.rows):
             group.rows.append(row)
@@ -209,7 +209,7 @@ def _corner(text: str, rows: dict[str, list[str]]) -> tuple[int, int, int]:
 
 
 def _table(rows: list[str], numbers: list[int], key: str, folder: ModelFolder) -> npt.NDArray[np.float64]:
-    """The numbers of all lines of a kind, a row a line; missing last columns are NaN."""
+    """The numbers of all lines of a kind, one row per line; missing last columns are NaN."""
     least = 2 if key == "vt" else 3
     if not rows:
         return np.zeros((0, least))
@@ -265,14 +265,14 @@ def _check_indices(
 
 
 def _vertices_of(corners: list[str], count: int) -> npt.NDArray[np.int64]:
-    """Indices from 0 of the vertices that lines and points refer to; what cannot be understood is not counted."""
+    """Indices from 0 of the vertices that lines and points refer to; malformed ones are ignored."""
     found = [int(corner.partition("/")[0]) for corner in corners if corner.partition("/")[0].isdecimal()]
     indices = np.array([index for index in found if index <= count], dtype=np.int64) - 1
     return indices[indices >= 0]
 
 
 def _white(vertices: npt.NDArray[np.float64]) -> float:
-    """What is white in the vertex colours of a file: 1, or 255 where any number is above 1."""
+    """The value of white in the vertex colours of a file: 1, or 255 if any number is above 1."""
     colours = vertices[:, 3:6]
     return 255.0 if (colours[np.isfinite(colours)] > 1).any() else 1.0
 
@@ -308,7 +308,7 @@ def _geometry(
         keywords["visual"] = TextureVisuals(material=PBRMaterial(baseColorFactor=DEFAULT_COLOUR, metallicFactor=0.0))
     if vertices.shape[1] >= 6 and "vertex_colors" not in keywords:
         warnings.append(
-            f"{name}: vertex colours left out, the material counts"
+            f"{name}: vertex colours left out, its material is drawn instead"
             if material is not None
             else f"{name}: vertex colours left out, some vertices have none"
         )

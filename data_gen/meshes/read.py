@@ -1,4 +1,4 @@
-"""Reads a mesh file of any format: the check that belongs to it, then its reader, and one kind of error from all."""
+"""Reads mesh files of any format, with checks and a single type of error."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def read_scene(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourS
     """Read a mesh file of any format.
 
     Returns:
-        A scene in the file's coordinates, what its plain colours are, and warnings.
+        A scene in the file's coordinates, the colour space of its plain colours, and warnings.
 
     Raises:
         MeshError: if the file is damaged, was cut, or is refused.
@@ -57,7 +57,7 @@ def _read(data: bytes, suffix: str, folder: ModelFolder) -> tuple[trimesh.Scene,
 
 @contextlib.contextmanager
 def _strict_loaders() -> Generator[None, None, None]:
-    """Keep the loaders' log quiet, and turn numpy's remark that a text was not read to its end into an error."""
+    """Silence the loaders' log, and turn NumPy's warning that a text was not read to its end into an error."""
     logger = logging.getLogger("trimesh")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)

@@ -1,4 +1,4 @@
-"""ShapeNetCore as it is on disk: its classes, the models of a tree (versions 1 and 2), and their splits."""
+"""ShapeNetCore on disk: its classes, the models of a tree (versions 1 and 2), and their splits."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _TABLE = """
 """
 
 SYNSETS: dict[str, str] = dict(zip(_TABLE.split()[::2], _TABLE.split()[1::2], strict=True))
-"""The 55 classes of ShapeNetCore: synset number to a name without spaces."""
+"""The 55 classes of ShapeNetCore: synset number to name without spaces."""
 
 _V1, _V2 = Path("model.obj"), Path("models/model_normalized.obj")
 _LARGEST_SPLIT = 64 * 2**20  # bytes; the official file has 3.5 million
@@ -51,7 +51,7 @@ class ShapeNetModel:
         synset: number of its class, 8 digits.
         model_id: its name in the tree, unique in its class.
         path: its OBJ file.
-        folder: that holds it and its textures.
+        folder: the folder of the model and its textures.
     """
 
     synset: str
@@ -61,7 +61,7 @@ class ShapeNetModel:
 
 
 def class_of_synset(synset: str) -> str:
-    """Name of a synset; the number itself if it is none of ShapeNetCore's.
+    """Name of a synset; the number itself if it is not in ShapeNetCore.
 
     >>> class_of_synset("02958343")
     'car'
@@ -78,10 +78,10 @@ def find_models(folder: Path) -> list[ShapeNetModel]:
     """List the models of a tree, or of one class of it.
 
     Args:
-        folder: the folder with the synsets, or one synset's.
+        folder: the folder with the synsets, or that of one synset.
 
     Returns:
-        The models, sorted by synset and name. A folder without a model file in it is not one of them.
+        The models, sorted by synset and name. Folders without a model file are skipped.
     """
     models = []
     for synset in _synset_folders(folder):
@@ -93,7 +93,7 @@ def find_models(folder: Path) -> list[ShapeNetModel]:
 
 
 def paper_split(models: list[ShapeNetModel]) -> dict[tuple[str, str], str]:
-    """The split of the paper's 200 x 200 data, as AtlasNet's: a class's names sorted, 80 % to train, the rest to test.
+    """The split of the paper's 200 x 200 data, as in AtlasNet: the first 80 % of a class by name train, the rest test.
 
     Returns:
         `train` or `test` by synset and model.
@@ -114,7 +114,7 @@ def read_split_file(path: Path) -> dict[tuple[str, str], str]:
         `train`, `val` or `test` by synset and model.
 
     Raises:
-        MeshError: if it cannot be read, a column is missing or a split is none of the three.
+        MeshError: if it cannot be read, a column is missing or a split is unknown.
     """
     split = {}
     try:
@@ -147,9 +147,9 @@ def _synset_folders(folder: Path) -> list[Path]:
 
 
 def _is_synset(folder: Path) -> bool:
-    """Whether a folder holds models and is named as a class of ShapeNetCore, or as another one of version 2."""
+    """Whether a folder holds models and has the name of a class of ShapeNetCore, or of another one in version 2."""
     number = folder.resolve().name
-    if re.fullmatch(r"\d{8}", number) is None:  # of dates, too
+    if re.fullmatch(r"\d{8}", number) is None:  # dates match, too
         return False
     kinds = (_V2, _V1) if number in SYNSETS else (_V2,)
     return any((entry / name).is_file() for entry in folder.iterdir() for name in kinds)

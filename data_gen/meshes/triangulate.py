@@ -13,7 +13,7 @@ __all__ = ["TOO_FEW_CORNERS", "concave", "fan", "retriangulate", "triangulate"]
 TOO_FEW_CORNERS = "faces with fewer than 3 corners left out"
 """The warning about such faces, after their number."""
 
-_FLAT = 1e-3  # sine of an angle that counts as straight
+_FLAT = 1e-3  # largest sine of an angle that counts as straight
 
 
 def fan(count: int) -> npt.NDArray[np.int64]:
@@ -27,10 +27,10 @@ def fan(count: int) -> npt.NDArray[np.int64]:
 
 
 def concave(polygons: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Which polygons have a corner that points inwards, so that a fan would fill what is outside.
+    """Which polygons have an inward corner, so that a fan would cover area outside.
 
     Args:
-        polygons: corners `(polygon, corner, 3)` of polygons of one size.
+        polygons: corners `(polygon, corner, 3)` of polygons of the same size.
 
     Returns:
         Whether each is concave `(polygon,)`.
@@ -49,10 +49,10 @@ def concave(polygons: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
 
 
 def triangulate(polygon: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Cut a polygon `(corner, 3)`, nearly in a plane, into triangles.
+    """Cut a nearly planar polygon `(corner, 3)` into triangles.
 
     Returns:
-        Corner indices `(corner - 2, 3)`, wound as the polygon; triangles that are not needed have three equal corners.
+        Corner indices `(corner - 2, 3)`, wound as the polygon; unneeded triangles have three equal corners.
 
     >>> triangulate(np.array([[0.2, 0.2, 0], [0, 1, 0], [0, 0, 0], [1, 0, 0]])).tolist()
     [[2, 3, 0], [2, 0, 1]]
@@ -81,7 +81,7 @@ def retriangulate(
 
     Args:
         triangles: vertex indices `(triangle, 3)`, a fan for each polygon.
-        polygons: for each polygon of four corners or more, where its fan begins and its vertex indices.
+        polygons: for each polygon of four corners or more, the start of its fan and its vertex indices.
         positions: vertices `(vertex, 3)`.
     """
     sizes = np.array([len(corners) for _, corners in polygons], dtype=np.int64)
@@ -95,6 +95,6 @@ def retriangulate(
 
 
 def _normals(polygons: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Newell's normals `(polygon, 3)`, not of length 1."""
+    """Newell's normals `(polygon, 3)`, not normalised."""
     moved = polygons - polygons[:, :1]
     return np.cross(moved, np.roll(moved, -1, axis=1)).sum(axis=1)

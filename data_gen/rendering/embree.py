@@ -1,9 +1,9 @@
-"""Drawing by ray casting with Embree: the fallback that needs no OpenGL, and the source of exact geometry.
+"""Rendering by ray casting with Embree: the fallback without OpenGL, and the source of exact geometry.
 
-Colours follow `shading`, the formula of the OpenGL shader, at the same sample positions, so the two renderers differ by
-rounding, by how they choose a texture's level, and in the order of translucent faces where OpenGL's, by their centres,
-is not that along the ray. Geometry (depth, normals, coordinates) is always cast, whatever draws the colours: at
-exact pixel centres and in double precision, where a depth buffer has 24 bits that are spread unevenly.
+Colours follow `shading`, the formula of the OpenGL shader, at the same sample positions. So the two renderers differ by
+rounding, by mipmap selection, and in the order of translucent faces where OpenGL's, by their centres, is not that along
+the ray. Geometry (depth, normals, coordinates) is always ray-cast, whatever renders the colours: at exact pixel centres
+and in double precision, while a depth buffer has 24 unevenly spread bits.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ __all__ = ["EmbreeRenderer", "Geometry", "cast_geometry"]
 
 Floats = npt.NDArray[np.float64]
 
-_MAX_LAYERS = 256  # far more than foliage has; nearly all rays end sooner, and those that ended cost nothing
+_MAX_LAYERS = 256  # far more than foliage has; nearly all rays end sooner, and then cost nothing
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """What the centre of each pixel sees of a surface that is at least half opaque; zero where there is none.
+    """The first surface at each pixel centre that is at least half opaque; zero where there is none.
 
     Attributes:
         depth: distance along the camera's z axis, float32 `(height, width)`.
@@ -46,7 +46,7 @@ class Geometry:
 
 
 class EmbreeRenderer:
-    """Draws by casting rays at a regular grid of samples in each pixel."""
+    """Renders by casting rays at a regular grid of samples in each pixel."""
 
     def __init__(self) -> None:
         import embreex
@@ -56,7 +56,7 @@ class EmbreeRenderer:
     def draw(
         self, surfaces: Sequence[ShadedSurface], rig: Rig, lighting: Lighting, supersample: int
     ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Draw all views, one after the other, as `mesh_renderer.ViewRenderer` says."""
+        """Render all views, as described in `mesh_renderer.ViewRenderer`."""
         scene = _Scene(surfaces)
         for pose, intrinsics in zip(rig.world_from_camera, rig.intrinsics, strict=True):
             picture = np.zeros((rig.height, rig.width, 4), dtype=np.float32)
@@ -101,7 +101,7 @@ def cast_geometry(surfaces: Sequence[ShadedSurface], rig: Rig) -> Iterator[Geome
 
 
 class _Scene:
-    """Surfaces, the ray caster and the textures, from which the colour of a hit is computed."""
+    """Surfaces, ray caster and textures, to compute the colours of hits."""
 
     def __init__(self, surfaces: Sequence[ShadedSurface]) -> None:
         self.surfaces = surfaces
@@ -114,7 +114,7 @@ class _Scene:
         self._emits = any(surface.emissive.any() for surface in surfaces)
 
     def extent(self, pose: Floats, intrinsics: Floats, rig: Rig) -> tuple[int, int, int, int]:
-        """Columns and rows (left, top, right, bottom) outside which no vertex is seen, the ends not included."""
+        """Columns and rows (left, top, right, bottom) outside which no vertex is seen, ends excluded."""
         points = (self._vertices - pose[:3, 3]) @ pose[:3, :3] @ intrinsics.T
         if points[:, 2].min() <= 1e-6:
             return 0, 0, rig.width, rig.height
@@ -161,11 +161,11 @@ class _Scene:
         return colours
 
     def normals(self, hits: Hits, view_directions: Floats) -> Floats:
-        """The normals (hit, 3) that are shaded."""
+        """The shading normals (hit, 3)."""
         return facing(self._interpolated(hits, "normals", 3), self.ray_caster.facets[hits.faces], view_directions)
 
     def base(self, hits: Hits, spread: tuple[Floats, Floats] | None) -> Floats:
-        """Linear base colours (hit, 4), alpha after the cutoff; textures at full size where no spread is given."""
+        """Linear base colours (hit, 4), alpha after the cutoff; textures at full size if no spread is given."""
         colours = np.ones((len(hits.rays), 4))
         for surface, number, selected in self._by_surface(hits):
             colour = np.broadcast_to(surface.base_colour, (len(selected), 4)).copy()
@@ -197,7 +197,7 @@ class _Scene:
         return light
 
     def _by_surface(self, hits: Hits) -> Iterator[tuple[ShadedSurface, npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
-        """Each surface that is hit, with the numbers of its faces and which hits are on it."""
+        """Each surface that is hit, with the faces and the indices of its hits."""
         owner = self.ray_caster.owner[hits.faces]
         for index in np.unique(owner):
             selected = np.flatnonzero(owner == index)
@@ -247,7 +247,7 @@ class _Scene:
 
 
 def _unpremultiplied(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """Straight uint8 of premultiplied RGBA, both from 0 to 255."""
+    """Premultiplied RGBA to straight uint8, both from 0 to 255."""
     alpha = picture[..., 3:]
     colour = np.divide(picture[..., :3] * 255.0, alpha, out=np.zeros_like(picture[..., :3]), where=alpha > 0)
     return np.clip(np.rint(np.concatenate((colour, alpha), axis=-1)), 0, 255).astype(np.uint8)

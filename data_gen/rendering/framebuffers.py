@@ -1,7 +1,7 @@
 """Framebuffers for supersampling in OpenGL, and the pass that averages the samples. Imports OpenGL.
 
-Averaging is left to OpenGL: a ninth of the bytes is read back, already with straight alpha. There is no multisampling:
-Mesa's software renderer shades each multisample, at more cost than a sample of its own has (5.0 ms against 2.9 for four
+OpenGL averages: a ninth of the bytes is read back, already with straight alpha. There is no multisampling: Mesa's
+software renderer shades each multisample, at a higher cost than that of a separate sample (5.0 ms against 2.9 for four
 samples a pixel of a car at 128x128).
 """
 
@@ -39,7 +39,7 @@ void main() {
 
 
 class SampleFramebuffers:
-    """Frame buffers for one size of picture.
+    """Framebuffers for one picture size.
 
     Args:
         width: pixels across.
@@ -48,7 +48,7 @@ class SampleFramebuffers:
 
     Attributes:
         size: the arguments.
-        drawn: OpenGL's name of the frame buffer to draw into, side times as wide and high, with depth.
+        drawn: OpenGL's name of the framebuffer to draw into, `side` times as wide and high, with depth.
     """
 
     def __init__(self, width: int, height: int, side: int) -> None:
@@ -87,7 +87,7 @@ class SampleFramebuffers:
         return np.frombuffer(cast(bytes, pixels), dtype=np.uint8).reshape(height, width, 4)
 
     def delete(self) -> None:
-        """Free all of it."""
+        """Free all buffers."""
         GL.glDeleteProgram(self._program)
         GL.glDeleteFramebuffers(2, [self.drawn, self._averaged])
         GL.glDeleteRenderbuffers(2, [self._depth, self._pixels])

@@ -1,8 +1,8 @@
 """Lights around an object, the same for every renderer.
 
-All lights but the headlight's are fixed to the WORLD, so a point of the object has the same diffuse colour from every
-view. Directions are unit vectors from the object TOWARDS the light, y up; colours are linear RGB, in units in which a
-white Lambertian surface that faces a light of colour 1 reflects 1.
+All lights but the headlight are fixed to the WORLD, so a point of the object has the same diffuse colour in every view.
+Directions are unit vectors from the object TOWARDS the light, y up; colours are linear RGB, in units in which a white
+Lambertian surface facing a light of colour 1 reflects 1.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ __all__ = ["LIGHTING_PRESETS", "MAX_LIGHTS", "Light", "Lighting", "resolve_light
 Vector = tuple[float, float, float]
 
 MAX_LIGHTS = 4
-"""Most directional lights a Lighting may hold."""
+"""Most directional lights of a Lighting."""
 
 LIGHTING_PRESETS = ("studio", "headlight", "random")
-"""Names that resolve_lighting knows."""
+"""Names for `resolve_lighting`."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Light:
 
     Attributes:
         direction: unit vector towards the light, in world axes, or in OpenCV camera axes for a headlight.
-        colour: linear RGB; 1 makes a white surface that faces the light white.
+        colour: linear RGB; with 1, a white surface facing the light is white.
     """
 
     direction: Vector
@@ -39,14 +39,14 @@ class Light:
 
 @dataclass(frozen=True)
 class Lighting:
-    """Directional lights over an ambient light that fades from the sky to the ground.
+    """Directional lights and an ambient light that changes from sky to ground.
 
     Attributes:
         lights: up to MAX_LIGHTS directional lights.
-        sky: ambient light on a surface that faces up, linear RGB.
-        ground: ambient light on a surface that faces down, linear RGB.
+        sky: ambient light on a surface facing up, linear RGB.
+        ground: ambient light on a surface facing down, linear RGB.
         follows_camera: whether the lights' directions are in OpenCV camera axes instead of world axes.
-        is_constant: whether it is the same for many objects, so that a renderer may compile it into a shader.
+        is_constant: whether many objects share it, so that a renderer may compile it into a shader.
 
     Raises:
         ValueError: if there are too many lights, a direction is not a unit vector or a colour is negative.
@@ -88,10 +88,10 @@ class Lighting:
 
 
 def resolve_lighting(lighting: str | Lighting, *, seed: int = 0) -> Lighting:
-    """Return the lighting of a name, or the lighting itself.
+    """The lighting with a name, or the given lighting.
 
     Args:
-        lighting: `studio`, `headlight`, `random`, or a Lighting, which is returned as it is.
+        lighting: `studio`, `headlight`, `random`, or a Lighting, which is returned unchanged.
         seed: seed of `random`; the same seed gives the same lights.
 
     Returns:
@@ -127,7 +127,7 @@ def _grey(value: float, warmth: float = 0.0) -> Vector:
 
 
 def _random(seed: int) -> Lighting:
-    """Three lights at random on the upper sphere around a random ambient light, together as bright as the studio."""
+    """Three random lights on the upper hemisphere and a random ambient light, together as bright as the studio."""
     generator = np.random.default_rng(seed)
     lights = []
     for strength in (0.5, 0.22, 0.12):

@@ -24,7 +24,7 @@ from data_gen.rigs import Rig
 __all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "RenderError", "Rendering", "ViewRenderer"]
 
 CHANNELS = ("rgba", "depth", "normals", "coordinates")
-"""What render can return."""
+"""What `render` can return."""
 
 MAX_SUPERSAMPLE = 8
 """Most samples along a side of a pixel."""
@@ -39,8 +39,8 @@ class Rendering:
     Attributes:
         rgba: colours uint8 `(view, height, width, 4)`, sRGB, straight alpha.
         depth: distance along the camera's z axis float32 `(view, height, width)`, world units.
-        normals: unit normals towards the camera float32 `(view, height, width, 3)`, world axes, as they are shaded:
-            interpolated on what is smooth, the face's own elsewhere.
+        normals: shading normals towards the camera float32 `(view, height, width, 3)`, unit vectors in world axes:
+            interpolated on smooth surfaces, the face's own elsewhere.
         coordinates: points on the surface float32 `(view, height, width, 3)`, world units.
     """
 
@@ -51,26 +51,26 @@ class Rendering:
 
 
 class ViewRenderer(Protocol):
-    """What `EmbreeRenderer` and `PyrenderRenderer` have in common; `detail` says what draws, one line."""
+    """The interface of `EmbreeRenderer` and `PyrenderRenderer`; `detail` describes the renderer in one line."""
 
     detail: str
 
     def draw(
         self, surfaces: Sequence[ShadedSurface], rig: Rig, lighting: Lighting, supersample: int
     ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Draw the surfaces from each camera of the rig, with supersample x supersample samples a pixel.
+        """Render the surfaces from each camera of the rig, with supersample x supersample samples per pixel.
 
         Yields:
-            sRGB with straight alpha `(height, width, 4)`, a view at a time.
+            sRGB with straight alpha `(height, width, 4)`, one view at a time.
         """
         ...
 
 
 class MeshRenderer:
-    """Draws meshes with the renderer that works here.
+    """Renders meshes with the best renderer that works here.
 
-    All MeshRenderers of a process that draw with pyrender share its one renderer, so making another costs nothing; they
-    must all be used in the thread that made the first. The process keeps its OpenGL context.
+    All MeshRenderers of a process that use pyrender share one renderer, so another one costs nothing; they must all be
+    used in the thread that made the first. The process keeps its OpenGL context.
 
     Args:
         renderer: the name of a renderer, or None for the best that works here.
@@ -78,11 +78,11 @@ class MeshRenderer:
 
     Raises:
         RendererError: if no renderer works, or the one named does not.
-        ValueError: if supersample is out of range or the renderer has an unknown name.
+        ValueError: if supersample is out of range or the renderer is unknown.
 
     Attributes:
         name: name of the renderer, one of `data_gen.rendering.renderers.RENDERERS`.
-        detail: what draws, e.g. the OpenGL renderer and version.
+        detail: description, e.g. the OpenGL renderer and version.
         supersample: samples along a side of a pixel.
     """
 
@@ -104,14 +104,14 @@ class MeshRenderer:
         name: str = "object",
         seed: int = 0,
     ) -> Rendering:
-        """Draw an object from every camera of a rig.
+        """Render an object from every camera of a rig.
 
         Args:
-            parts: meshes in world coordinates, as `shaded_surfaces` takes them.
+            parts: meshes in world coordinates, as for `shaded_surfaces`.
             rig: the cameras.
             lighting: name of a preset or a Lighting.
             channels: what to return, of CHANNELS.
-            name: what to call the object in errors.
+            name: name of the object in errors.
             seed: seed of random lighting.
 
         Returns:
@@ -119,7 +119,7 @@ class MeshRenderer:
 
         Raises:
             RenderError: if the parts cannot be drawn, or nothing of them is visible in any view.
-            ValueError: if lighting or a channel has an unknown name.
+            ValueError: if the lighting or a channel is unknown.
         """
         unknown = sorted(set(channels) - set(CHANNELS))
         if unknown or not channels:
@@ -159,7 +159,7 @@ def _make_renderer(name: str) -> ViewRenderer:
         return PyrenderRenderer(name.removeprefix("pyrender-"))
     except RendererError:
         raise
-    except Exception as error:  # missing libraries and drivers show as nearly any type
+    except Exception as error:  # missing libraries and drivers raise nearly any type
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise RendererError(
             f"renderer {name!r}: expected it to start, found {reason}. Remedy: {REMEDIES[name]}"

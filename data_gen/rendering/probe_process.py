@@ -1,6 +1,6 @@
-"""The program that tries one renderer: `python -m data_gen.rendering.probe_process NAME` draws and checks a picture.
+"""Program to probe one renderer: `python -m data_gen.rendering.probe_process NAME` renders and checks a picture.
 
-It runs in a process of its own, since a renderer that does not work may take its process with it.
+It runs in its own process, since a broken renderer may crash it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ __all__ = ["draw_test_image"]
 
 
 def draw_test_image(name: str) -> str:
-    """Draw half a picture full of red triangle and check it.
+    """Render a picture whose left half is red, and check it.
 
     Returns:
-        What drew it, one line.
+        A description of the renderer, one line.
 
     Raises:
-        RendererError: if the picture is another one.
+        RendererError: if the picture is wrong.
     """
     corners = [[-9.0, -9.0, 0.0], [0.0, -9.0, 0.0], [0.0, 9.0, 0.0], [-9.0, 9.0, 0.0]]
     sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)

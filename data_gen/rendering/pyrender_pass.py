@@ -1,8 +1,8 @@
 """The OpenGL pass that draws surfaces inside a pyrender Renderer. Only pyrender_renderer imports it.
 
-pyrender keeps the context, the vertex buffers and the textures; the pass itself is our own, because pyrender's lights
-back faces with ambient light only, squares the alpha of what is translucent, multiplies vertex colours in after the
-light, and reads a depth buffer that is not needed. Every sample is shaded (supersampling, not multisampling).
+pyrender manages the context, the vertex buffers and the textures; the pass is our own, because pyrender's lights back
+faces with ambient light only, squares the alpha of translucent surfaces, multiplies vertex colours after lighting, and
+reads an unneeded depth buffer. Every sample is shaded (supersampling, not multisampling).
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ _OUTER, _INNER = 1.0, -1.0
 # Drawn with flipped rows, so that glReadPixels, which starts at the bottom, returns the first row on top; the flip
 # reverses the winding of every triangle.
 _HIDDEN = {_OUTER: GL.GL_FRONT, _INNER: GL.GL_BACK}
-# COINCIDENT in the least steps of 24 bits of depth: 0.44 of it is one of depth from a camera at distance 3. None for a
-# face's slope, which would push inner sides behind outer ones at an outline.
+# COINCIDENT in steps of 24-bit depth; one step is 0.44 of it at distance 3. No offset for the slope of a face, which
+# would push inner sides behind outer ones at silhouettes.
 _OFFSET = 0.44 * COINCIDENT * 2**24
 _FLIP_ROWS = np.diag([1.0, -1.0, 1.0, 1.0])
 
@@ -49,19 +49,19 @@ class Drawable:
 
     Args:
         surface: what to draw.
-        textures: pyrender textures made so far, by the identity of their texels and how they go on, so that surfaces
+        textures: pyrender textures made so far, by the identity of their texels and wrap modes, so that surfaces
             share them.
 
     Attributes:
-        defines: what its program needs to be compiled with.
-        constants: what of its material may be compiled in.
+        defines: preprocessor definitions for its program.
+        constants: material constants that may be compiled in.
     """
 
     def __init__(self, surface: ShadedSurface, textures: dict[_TextureKey, Texture]) -> None:
         self.surface = surface
         self.base_texture = _texture(surface.texture, surface.wrap, textures)
         self.emissive_texture = _texture(surface.emissive_texture, surface.emissive_wrap, textures)
-        # pyrender uploads the textures of a primitive's material; nothing else of the material is used.
+        # pyrender uploads the textures of a primitive's material; the rest of the material is unused.
         material = MetallicRoughnessMaterial(baseColorTexture=self.base_texture, emissiveTexture=self.emissive_texture)
         self.primitive = Primitive(
             positions=surface.positions,
@@ -95,13 +95,13 @@ class SurfaceRenderer(Renderer):
     """A pyrender Renderer that draws surfaces into RGBA with straight alpha."""
 
     def load(self, surfaces: Sequence[ShadedSurface]) -> list[Drawable]:
-        """Put surfaces into the context, in place of those that were there.
+        """Upload surfaces to the context, replacing the previous ones.
 
         Args:
-            surfaces: what to draw from now on; none empties the context.
+            surfaces: the surfaces to draw from now on; an empty list clears the context.
 
         Returns:
-            What `draw` takes: what is solid first, by the program that draws it.
+            Drawables for `draw`, opaque ones first, ordered by program.
         """
         textures: dict[_TextureKey, Texture] = {}
         drawables = [Drawable(surface, textures) for surface in surfaces]
@@ -123,7 +123,7 @@ class SurfaceRenderer(Renderer):
         """Draw one view.
 
         Args:
-            drawables: what `load` returned.
+            drawables: as returned by `load`.
             size: pixels across, pixels down, and samples along a side of a pixel.
             clip_from_world: OpenGL's view and projection `(4, 4)`.
             camera: the camera's position `(3,)` in world axes.
@@ -146,7 +146,7 @@ class SurfaceRenderer(Renderer):
         GL.glClear(int(GL.GL_COLOR_BUFFER_BIT) | int(GL.GL_DEPTH_BUFFER_BIT))
         view = (_FLIP_ROWS @ clip_from_world, camera, lighting, light_directions)
         bound: ShaderProgram | None = None
-        # Outer sides first: what they hide is not shaded. Inner ones are drawn a little farther away than they are, so
+        # Outer sides first, so that hidden samples are not shaded. Inner ones are drawn slightly farther away, so
         # that an outer side in the same place, whether of a face with the same corners or not, is the one seen.
         GL.glPolygonOffset(0.0, _OFFSET)
         for side in (_OUTER, _INNER):
@@ -154,7 +154,7 @@ class SurfaceRenderer(Renderer):
                 bound = self._draw_side(drawable, bound, view, OPAQUE_TEXELS, side)
             GL.glEnable(GL.GL_POLYGON_OFFSET_FILL)
         GL.glDisable(GL.GL_POLYGON_OFFSET_FILL)
-        # Inner sides of what is one-sided fill what would be holes, behind all else: no object reaches this far.
+        # Inner sides of one-sided surfaces fill holes, behind everything else: no object reaches this far.
         GL.glDepthRange(1.0 - 2.0**-13, 1.0)
         for drawable in drawables:
             if drawable.surface.culled and drawable.surface.opaque:
@@ -162,8 +162,8 @@ class SurfaceRenderer(Renderer):
         GL.glDepthRange(0.0, 1.0)
         translucent = [drawable for drawable in drawables if not drawable.surface.opaque]
         if translucent:
-            # Surfaces from far to near by their centres, of each its inner sides and then its outer ones, face by face:
-            # right for a solid and for panes that face one way; where others overlap, a farther one may be in front.
+            # Surfaces from far to near by their centres, each with its inner sides before its outer ones, face by face:
+            # correct for a solid and for panes facing one way; where others overlap, a farther one may be in front.
             translucent.sort(key=lambda drawable: -float(np.linalg.norm(drawable.centre - camera)))
             GL.glEnable(GL.GL_BLEND)
             GL.glBlendFunc(GL.GL_ONE, GL.GL_ONE_MINUS_SRC_ALPHA)
@@ -177,7 +177,7 @@ class SurfaceRenderer(Renderer):
         return picture
 
     def delete(self) -> None:
-        """Free everything that OpenGL holds for this renderer."""
+        """Free all OpenGL resources of this renderer."""
         for program in self.__dict__.pop("_surface_programs", {}).values():
             program.delete()
         buffers: SampleFramebuffers | None = self.__dict__.pop("_sample_buffers", None)
@@ -186,7 +186,7 @@ class SurfaceRenderer(Renderer):
         super().delete()
 
     def _buffers(self, size: tuple[int, int, int]) -> SampleFramebuffers:
-        """The buffers of the last view where their size fits, else others in their place."""
+        """The buffers of the last view if their size fits, else new ones."""
         buffers: SampleFramebuffers | None = self.__dict__.get("_sample_buffers")
         if buffers is None or buffers.size != size:
             if buffers is not None:
@@ -217,7 +217,7 @@ class SurfaceRenderer(Renderer):
         *,
         culled: bool = False,
     ) -> ShaderProgram | None:
-        """Draw the faces seen from a side, or the culled ones, and return the program that is then bound."""
+        """Draw the faces seen from a side, or the culled ones, and return the program bound afterwards."""
         every = side == _OUTER or culled
         count = len(drawable.surface.faces) if every else drawable.surface.two_sided
         if count == 0:
@@ -242,7 +242,7 @@ class SurfaceRenderer(Renderer):
 
 
 def _upload(faces: npt.NDArray[np.int64]) -> None:
-    """Put faces in place of the first ones of the primitive that is bound."""
+    """Replace the first faces of the bound primitive."""
     indices = np.ascontiguousarray(faces, dtype=np.uint32)
     GL.glBufferSubData(GL.GL_ELEMENT_ARRAY_BUFFER, 0, indices.nbytes, indices)
 
@@ -252,7 +252,7 @@ def _program_key(drawable: Drawable) -> tuple[Any, ...]:
 
 
 def _aligned(surface: ShadedSurface) -> bool:
-    """Whether all normals are on the outer side of their face, so that the face need not be looked at to turn them."""
+    """Whether all normals are on the outer side of their face, so that the shader need not check."""
     corners = surface.positions[surface.faces]
     facets = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     agreement = np.einsum("fi,fci->fc", facets, surface.normals[surface.faces])

@@ -1,4 +1,4 @@
-"""Drawing with pyrender on EGL or OSMesa. Imports pyrender when the first renderer is made, never before."""
+"""Rendering with pyrender on EGL or OSMesa. Imports pyrender only when the first renderer is made."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from hyperplanes.utilities.axes import flip_camera_axes
 __all__ = ["PyrenderRenderer"]
 
 
-# Deleting any EGL renderer ends all others of the process, so there is one, which lives as long as the process does.
+# Deleting any EGL renderer breaks all others of the process, so there is only one, which is never deleted.
 _renderer: Any = None
 _made_in: tuple[int, int] | None = None
 
 
 class PyrenderRenderer:
-    """Draws with the one pyrender OffscreenRenderer of this process.
+    """Renders with the single pyrender OffscreenRenderer of this process.
 
     Args:
         platform: `egl` or `osmesa`.
@@ -46,7 +46,7 @@ class PyrenderRenderer:
     def draw(
         self, surfaces: Sequence[ShadedSurface], rig: Rig, lighting: Lighting, supersample: int
     ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Draw all views, one after the other, as `mesh_renderer.ViewRenderer` says."""
+        """Render all views, as described in `mesh_renderer.ViewRenderer`."""
         _check_owner()
         renderer = self._renderer
         drawables = renderer.load(surfaces)
@@ -64,7 +64,7 @@ class PyrenderRenderer:
 def _projection(
     intrinsics: npt.NDArray[np.float64], rig: Rig, pose: npt.NDArray[np.float64], radius: float
 ) -> npt.NDArray[np.float64]:
-    """OpenGL's projection: pixel (0, 0) of the intrinsics is centred half a pixel inside OpenGL's window."""
+    """OpenGL's projection: the centre of pixel (0, 0) of the intrinsics is half a pixel inside OpenGL's window."""
     import pyrender
 
     distance = float(np.linalg.norm(pose[:3, 3]))
@@ -87,7 +87,7 @@ def _shared_renderer(platform: str) -> Any:
 
         from data_gen.rendering.pyrender_pass import SurfaceRenderer
 
-        # pyrender makes the context; its own renderer, which has drawn nothing yet, gives way to ours.
+        # pyrender makes the context; our renderer replaces its own, which has drawn nothing yet.
         context = pyrender.OffscreenRenderer(64, 64)
         context._renderer = SurfaceRenderer(64, 64)
         _renderer, _made_in = context, (os.getpid(), threading.get_ident())
@@ -110,7 +110,7 @@ def _check_owner() -> None:
 
 
 def _import_pyrender(platform: str) -> None:
-    """Import pyrender for a platform, which OpenGL reads from the environment once."""
+    """Import pyrender for a platform; PyOpenGL reads it from the environment once."""
     current = os.environ.get("PYOPENGL_PLATFORM")
     if "OpenGL.platform" in sys.modules and current != platform:
         raise RendererError(
@@ -119,9 +119,9 @@ def _import_pyrender(platform: str) -> None:
         )
     os.environ["PYOPENGL_PLATFORM"] = platform
     with warnings.catch_warnings():
-        # What old releases of these packages say about themselves on import concerns their makers, not our users.
+        # Import warnings of old releases of these packages do not concern users.
         warnings.simplefilter("ignore")
         import pyglet
 
-        pyglet.options["headless"] = True  # or pyglet, which pyrender's window imports, looks for X11
+        pyglet.options["headless"] = True  # otherwise pyglet, imported by pyrender's window, needs X11
         import pyrender  # noqa: F401

@@ -1,8 +1,8 @@
-"""Rays against the triangles of surfaces: Embree finds the face, double precision finds the point on it.
+"""Ray casting against triangles: Embree finds the face, double precision the point on it.
 
-Embree works in single precision. It only decides which face a ray meets first; where on the face is computed from the
-face's plane in double precision, so points are exact however far the camera is. Where an inner and an outer side lie
-in the same place, the outer one is met; an inner side of a culled surface is met where nothing else is.
+Embree works in single precision. It only decides which face a ray hits first; the point is computed from the plane of
+the face in double precision, so points are exact at any camera distance. Where an inner and an outer side coincide, the
+outer one is hit; an inner side of a culled surface is hit only where nothing else is.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ Indices = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays first meet a face.
+    """The first hits of rays.
 
     Attributes:
         rays: index `(hit,)` of the ray.
         faces: index `(hit,)` of the face among those of all surfaces.
-        distances: multiple `(hit,)` of the ray's direction at which it meets the face.
-        points: where they meet `(hit, 3)`, world axes.
+        distances: multiple `(hit,)` of the ray's direction at the hit.
+        points: the hit points `(hit, 3)`, world axes.
         corners: barycentric weights `(hit, 3)` of the face's corners.
     """
 
@@ -47,9 +47,9 @@ class RayCaster:
         surfaces: the surfaces; faces are numbered through them in order.
 
     Attributes:
-        facets: face normals `(face, 3)`, not normalised, in the sense of the winding.
+        facets: face normals `(face, 3)` by the winding, not normalised.
         gradients: gradients `(face, 2, 3)` of the barycentric weights of each face's second and third corner.
-        owner: index `(face,)` of the surface that a face belongs to.
+        owner: index `(face,)` of the surface of each face.
         first_face: index `(surface,)` of each surface's first face.
     """
 
@@ -79,12 +79,12 @@ class RayCaster:
         """Find the first face on each ray.
 
         Args:
-            origin: where all rays start `(3,)`.
+            origin: origin of all rays `(3,)`.
             directions: their directions `(ray, 3)`, of any length.
-            after: multiples of the directions `(ray,)` before which nothing counts, or None for 0.
+            after: multiples of the directions `(ray,)` from which on hits count, or None for 0.
 
         Returns:
-            The hits, in the order of the rays; rays that meet nothing have none.
+            The hits, in the order of the rays; rays without a hit are left out.
         """
         starts = np.broadcast_to(origin, directions.shape) if after is None else origin + after[:, None] * directions
         faces = self._first(origin, starts, directions)
@@ -116,13 +116,13 @@ class RayCaster:
         return faces
 
     def _towards(self, origin: Floats) -> Floats:
-        """Positive for the faces (face,) whose outer side is seen from a point."""
+        """Numbers (face,) that are positive for faces whose outer side faces a point."""
         return np.einsum("fi,fi->f", self.facets, origin - self._start)
 
     def _outer_where_coincident(
         self, origin: Floats, starts: Floats, directions: Floats, faces: Indices
     ) -> tuple[Indices, Floats]:
-        """The faces, with an outer side in place of an inner one that lies on it; and their distances."""
+        """The faces, with inner sides replaced by coincident outer ones, and their distances."""
         distances = self._distances(origin, directions, faces)
         inner = np.flatnonzero(np.einsum("ri,ri->r", self.facets[faces], directions) > 0.0)
         if len(inner) == 0:
@@ -139,7 +139,7 @@ class RayCaster:
         return faces, distances
 
     def _distances(self, origin: Floats, directions: Floats, faces: Indices) -> Floats:
-        """Multiples of the directions at which they meet the planes of faces; infinite where they are parallel."""
+        """Multiples of the directions at which rays meet the planes of faces; infinite for parallel ones."""
         facets = self.facets[faces]
         height = np.einsum("ri,ri->r", facets, directions)
         start = np.einsum("ri,ri->r", self._start[faces] - origin, facets)
@@ -167,7 +167,7 @@ class _EmbreeFaces:
 
 
 def pixel_rays(pose: Floats, intrinsics: Floats, columns: Floats, rows: Floats) -> Floats:
-    """Rays through points of the image, scaled so that their multiples are depths along the camera's z axis.
+    """Rays through points of the image, scaled to unit depth along the camera's z axis.
 
     Args:
         pose: world_from_camera `(4, 4)`, OpenCV axes.

@@ -1,8 +1,7 @@
-"""Which renderer works on this machine: each is probed by drawing a triangle in a subprocess.
+"""Which renderers work on this machine: each is probed by rendering a picture in a subprocess.
 
-Order: pyrender on EGL; pyrender on OSMesa; Embree ray casting, which needs nothing beyond the installed packages. A
-library that is missing, a driver that crashes and a driver that draws nothing all show in the subprocess, and none of
-them can crash the calling process.
+Order: pyrender on EGL; pyrender on OSMesa; Embree ray casting, which needs only the installed packages. The subprocess
+reveals missing libraries, and drivers that crash or draw nothing, without harm to the calling process.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ REMEDIES = {
     "pyrender-osmesa": "apt-get install -y libosmesa6 && pip install 'PyOpenGL>=3.1.7'",
     "embree": "pip install embreex",
 }
-"""The command that should make a renderer work on Debian and Ubuntu."""
+"""Commands that should make a renderer work on Debian and Ubuntu."""
 
 _PROBE_SECONDS = 90.0
 
 
 class RendererError(ValueError):
-    """No renderer works, or the one that was named does not."""
+    """No renderer works, or the named one does not."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,8 @@ class RendererInfo:
 
     Attributes:
         name: one of RENDERERS.
-        detail: what draws, e.g. the OpenGL renderer and version.
-        advice: what could be done to get a better one, one line each; empty when this is the best.
+        detail: description, e.g. the OpenGL renderer and version.
+        advice: how to get better ones, one line each; empty if this is the best.
     """
 
     name: str
@@ -57,13 +56,13 @@ class RendererInfo:
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """What came of trying one renderer.
+    """The result of probing a renderer.
 
     Attributes:
         name: one of RENDERERS.
-        works: whether it drew the test picture right.
-        message: what draws, or what went wrong, one line.
-        remedy: the command that should fix it; empty when it works.
+        works: whether it rendered the test picture correctly.
+        message: its description, or the error, one line.
+        remedy: the command that should fix it; empty if it works.
     """
 
     name: str
@@ -76,13 +75,13 @@ _cache: dict[str, ProbeResult] = {}
 
 
 def probe(name: str) -> ProbeResult:
-    """Try one of RENDERERS in a subprocess; a second call in this process answers from memory.
+    """Probe one of RENDERERS in a subprocess; results are cached in this process.
 
     Returns:
-        The outcome. A renderer that does not work is an outcome, not an error.
+        The result; a renderer that does not work is not an error.
 
     Raises:
-        ValueError: if no renderer has that name.
+        ValueError: if the name is unknown.
     """
     if name not in RENDERERS:
         raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}")
@@ -92,25 +91,25 @@ def probe(name: str) -> ProbeResult:
 
 
 def probe_all() -> list[ProbeResult]:
-    """Try every renderer, best first, for a report of what works here.
+    """Probe every renderer, best first.
 
     Returns:
-        One outcome for each of RENDERERS.
+        One result for each of RENDERERS.
     """
     return [probe(name) for name in RENDERERS]
 
 
 def find_renderer(prefer: str | None = None) -> RendererInfo:
-    """Find the best renderer that works here. Each is tried once in a process; workers are told the name.
+    """Find the best renderer that works here. Each is probed once per process; workers are given the name.
 
     Args:
-        prefer: one of RENDERERS, which then must work, or None for the best that does; another is a ValueError.
+        prefer: one of RENDERERS, which must work, or None for the best that does; other names are a ValueError.
 
     Returns:
-        The renderer, with advice when a better one could be had.
+        The renderer, with advice on better ones.
 
     Raises:
-        RendererError: if the renderer named, or every renderer, does not work; the message holds the remedy.
+        RendererError: if the named renderer, or every renderer, does not work; the message contains the remedy.
     """
     if prefer is not None:
         outcome = probe(prefer)

@@ -1,10 +1,10 @@
-"""The OpenGL program that shades surfaces, compiled for what a surface needs. Imports OpenGL.
+"""The OpenGL programs that shade surfaces, compiled for the features of a surface. Imports OpenGL.
 
-Shading is the formula of `data_gen.rendering.shading`, with which `embree` shades too, arranged for speed: software
-OpenGL spends half of its time here. Half vectors are never normalised (`|L + V|^2 = 2 + 2 L.V`), the curves of sRGB
-are polynomials (their errors, of 0.05 of 255, are below that of the 8 bits that follow), lights are unrolled, what a
-surface does not have is not compiled in, and what is the same for nearly all surfaces is compiled in as a constant:
-llvmpipe loads a uniform anew for every few pixels (2.2 ms a picture of a car with constants, 3.1 with uniforms).
+Shading is the formula of `data_gen.rendering.shading`, as in `embree`, arranged for speed: software OpenGL spends half
+of its time here. Half vectors are never normalised (`|L + V|^2 = 2 + 2 L.V`), the sRGB curves are polynomials (their
+error of 0.05 of 255 is below that of 8 bits), lights are unrolled, unused features are not compiled in, and values that
+are the same for nearly all surfaces are constants: llvmpipe reloads a uniform every few pixels (2.2 ms a picture of a
+car with constants, 3.1 with uniforms).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 OPAQUE_TEXELS, TRANSLUCENT_TEXELS = 0, 1
-"""Which texels of a surface that is not opaque are drawn: those that hide what is behind, or the others."""
+"""Which texels of a translucent surface are drawn: the opaque ones, or the others."""
 
 Floats = npt.NDArray[np.float64]
 
@@ -185,11 +185,11 @@ _TYPES = {
     "shadowing": "float",
     "side": "float",
 }
-_COMMON_ROUGHNESS = (0.55, DEFAULT_ROUGHNESS)  # of generated objects, and of files that say nothing
+_COMMON_ROUGHNESS = (0.55, DEFAULT_ROUGHNESS)  # of generated objects, and of files that state none
 
 
 def constants_of_surface(surface: ShadedSurface) -> dict[str, str]:
-    """What of a surface's material is as with most surfaces, as GLSL by name; few values, so that programs stay few."""
+    """Common values of a surface's material as GLSL constants by name; only few, to limit the number of programs."""
     constants = {}
     if (surface.base_colour == 1.0).all():
         constants["base_colour"] = "vec4(1.0)"
@@ -206,7 +206,7 @@ def constants_of_surface(surface: ShadedSurface) -> dict[str, str]:
 
 @lru_cache(maxsize=8)
 def constants_of_lighting(lighting: Lighting) -> dict[str, str]:
-    """Lights that are for many objects and views, as GLSL by name; none of others."""
+    """Lights shared by many objects and views, as GLSL constants by name; empty for others."""
     if not lighting.is_constant or lighting.follows_camera or not lighting.lights:
         return {}
     unused = [np.zeros(3)] * (MAX_LIGHTS - len(lighting.lights))
@@ -224,9 +224,9 @@ def _roughness_constants(roughness: float) -> dict[str, float]:
 
 
 def compile_program(vertex: str, fragment: str, constants: dict[str, Any]) -> int:
-    """OpenGL's name of a program of two shaders, GLSL without version; `constants` are defined for the preprocessor."""
+    """OpenGL's name of a program from GLSL without version; `constants` are defined for the preprocessor."""
     head = "#version 330 core\n" + "".join(f"#define {name} {value}\n" for name, value in constants.items())
-    # Some drivers refuse to validate a program while no vertex array is bound.
+    # Some drivers do not validate a program without a bound vertex array.
     array = GL.glGenVertexArrays(1)
     GL.glBindVertexArray(array)
     program = shaders.compileProgram(
@@ -239,12 +239,12 @@ def compile_program(vertex: str, fragment: str, constants: dict[str, Any]) -> in
 
 
 class ShaderProgram:
-    """The shaders for surfaces that need the same, and where their uniforms are.
+    """The shaders for surfaces with the same features, and the locations of their uniforms.
 
     Args:
-        defines: what the surfaces need: UV, EMISSIVE_UV and COLOUR with the number of their vertex attribute,
-            TEXTURE, EMISSIVE_TEXTURE, TRANSLUCENT, UNLIT and ALIGNED, and LIGHTS, how many there are.
-        constants: GLSL of what would else be uniforms.
+        defines: features of the surfaces: UV, EMISSIVE_UV and COLOUR with the number of their vertex attribute,
+            TEXTURE, EMISSIVE_TEXTURE, TRANSLUCENT, UNLIT and ALIGNED, and LIGHTS, the number of lights.
+        constants: GLSL values that replace uniforms.
 
     Attributes:
         handle: OpenGL's name of the program.
@@ -264,13 +264,13 @@ class ShaderProgram:
         GL.glUniform1i(self._at("emissive_texture"), 1)
 
     def _at(self, name: str) -> int:
-        """Where a uniform is; -1, which OpenGL ignores, for one that is not compiled in."""
+        """The location of a uniform; -1, which OpenGL ignores, if it is not compiled in."""
         if name not in self._places:
             self._places[name] = GL.glGetUniformLocation(self.handle, name)
         return self._places[name]
 
     def set_view(self, clip_from_world: Floats, camera: Floats, lighting: Lighting, light_directions: Floats) -> None:
-        """Set what all surfaces of a view share; arguments as of `SurfaceRenderer.draw`."""
+        """Set the uniforms of a view; arguments as in `SurfaceRenderer.draw`."""
         GL.glUniformMatrix4fv(self._at("clip_from_world"), 1, GL.GL_TRUE, clip_from_world.astype(np.float32))
         GL.glUniform3fv(self._at("camera"), 1, camera.astype(np.float32))
         if self._lights and self._at("light_direction") >= 0:
@@ -280,12 +280,12 @@ class ShaderProgram:
         GL.glUniform3f(self._at("ground"), *lighting.ground)
 
     def set_surface(self, surface: ShadedSurface, layer: int, side: float) -> None:
-        """Set what is a surface's own.
+        """Set the uniforms of a surface.
 
         Args:
             surface: the surface.
             layer: OPAQUE_TEXELS or TRANSLUCENT_TEXELS.
-            side: 1 where the faces' outer sides are drawn, -1 for the inner ones.
+            side: 1 for the faces' outer sides, -1 for the inner ones.
         """
         GL.glUniform4f(self._at("base_colour"), *surface.base_colour)
         GL.glUniform3f(self._at("emissive"), *surface.emissive)
@@ -297,5 +297,5 @@ class ShaderProgram:
         GL.glUniform1i(self._at("layer"), layer)
 
     def delete(self) -> None:
-        """Free it."""
+        """Free the program."""
         GL.glDeleteProgram(self.handle)

@@ -1,9 +1,9 @@
-"""The shading formula in NumPy: what the OpenGL shader computes for a pixel, for arrays of points.
+"""The shading formula in NumPy, for arrays of points: the same as in the OpenGL shader.
 
-Light is added in linear units: ambient light that fades from sky to ground with the normal's height, and for each lamp
-a Lambertian term and a GGX highlight (Walter et al. 2007, with Smith's shadowing in Schlick's form). Normals are turned
-towards the camera, so that a sheet is lit on both its sides and the winding of a face does not matter. What is brighter
-than SHOULDER is compressed below white (tone mapping), and the result is encoded as sRGB.
+Light is summed in linear units: ambient light that changes from sky to ground with the normal's height, and for each
+light a Lambertian term and a GGX highlight (Walter et al. 2007, with Smith's shadowing in Schlick's form). Normals are
+flipped towards the camera, so that sheets are lit on both sides and the winding of faces does not matter. Values above
+SHOULDER are compressed below white (tone mapping), and the result is encoded as sRGB.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def facing(normals: Floats, facets: Floats, view_directions: Floats) -> Floats:
     """Unit normals on the side of the surface that the camera sees.
 
     Args:
-        normals: interpolated vertex normals `(point, 3)`, of any length; zero stands for the facet's.
+        normals: interpolated vertex normals `(point, 3)`, of any length; zero means the facet's.
         facets: normals of the faces `(point, 3)`, of any length and sign.
         view_directions: directions to the camera `(point, 3)`.
 
@@ -49,7 +49,7 @@ def shade(
     lighting: Lighting,
     directions: Floats,
 ) -> Floats:
-    """Colours that a camera sees.
+    """Shaded colours.
 
     Args:
         base: linear base colours `(point, 3)`.

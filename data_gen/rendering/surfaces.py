@@ -1,13 +1,12 @@
-"""What both renderers draw: triangles in world coordinates, with a small material model.
+"""The input of both renderers: triangles in world coordinates, with a small material model.
 
 Colours. Textures, vertex colours, face colours, the Kd and Ke of an MTL file and the colours of a COLLADA file are
 sRGB; a glTF `baseColorFactor` and `emissiveFactor` are linear, as glTF specifies. Everything is linear in a
 ShadedSurface.
 
-Material. Lambertian plus a soft GGX highlight. There is no environment to be mirrored, so metal would be black:
-metalness counts for at most MAX_METALLIC, and is 0 where a file states none. Roughness counts for at least
-MIN_ROUGHNESS, and is DEFAULT_ROUGHNESS where a file states none; a texture of both counts with its mean. Normal and
-occlusion maps are not drawn.
+Material. Lambertian plus a soft GGX highlight. There is no environment to reflect, so metal would be black: metalness
+is at most MAX_METALLIC, and 0 if a file states none. Roughness is at least MIN_ROUGHNESS, and DEFAULT_ROUGHNESS if a
+file states none; a texture of both is replaced by its mean. Normal and occlusion maps are not drawn.
 """
 
 from __future__ import annotations
@@ -47,19 +46,19 @@ __all__ = [
 ]
 
 MAX_METALLIC = 0.3
-"""Metalness above this is drawn as this."""
+"""Largest metalness that is drawn."""
 
 MIN_ROUGHNESS = 0.35
-"""Roughness below this is drawn as this."""
+"""Smallest roughness that is drawn."""
 
 DEFAULT_ROUGHNESS = 0.8
 """Roughness of a material that has none."""
 
 MAX_TEXTURE_SIDE = 2048
-"""Larger textures are reduced to this many texels a side before they are drawn."""
+"""Most texels per side; larger textures are reduced."""
 
 COINCIDENT = 1e-4
-"""Distance, in radii of the object, up to which an outer side behind an inner one counts as in the same place."""
+"""Largest distance, in radii of the object, at which an outer side behind an inner one counts as coincident."""
 
 _PLAIN = (0.72, 0.72, 0.72, 1.0)
 
@@ -67,7 +66,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class RenderError(ValueError):
-    """An object could not be drawn, or nothing of it can be seen."""
+    """An object that cannot be drawn, or of which nothing is visible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,26 +76,26 @@ class ShadedSurface:
     Attributes:
         positions: vertices `(vertex, 3)`.
         faces: vertex indices `(face, 3)`.
-        normals: unit vertex normals `(vertex, 3)`; zero where there is none, which stands for the face's own.
+        normals: unit vertex normals `(vertex, 3)`; zero for the face's own.
         uv: texture coordinates `(vertex, 2)`, v upwards; None without textures.
         colours: linear RGBA `(vertex, 4)` that multiplies the base colour, or None.
         base_colour: linear RGBA `(4,)`.
         texture: base colour texture uint8 `(height, width, 4)`, sRGB, first row on top, PREMULTIPLIED so that
-            filtering does not mix in what is transparent; None without.
+            filtering does not mix in transparent texels; None without.
         emissive: linear RGB `(3,)` that is added to the reflected light.
         emissive_texture: like texture, multiplies emissive.
-        emissive_uv: its coordinates where they are not `uv`; else None.
+        emissive_uv: its coordinates if they differ from `uv`, else None.
         wrap: wrap mode of the texture along u and along v.
         emissive_wrap: that of emissive_texture.
         roughness: in [MIN_ROUGHNESS, 1].
         metallic: in [0, MAX_METALLIC].
         cutoff: alpha below this is transparent, from it on opaque (glTF MASK); None for alpha that blends.
-        opaque: whether all of it hides what is behind.
-        unlit: whether the base colour is seen as it is, whatever the light.
-        two_sided: how many of its faces, the first ones, may be seen from both sides. Of the others only the outer side
-            is: none of a closed solid, and none of a face that another one, turned the other way, lies on.
-        culled: whether the inner sides of its faces hide nothing, as those of glTF's one-sided materials: they are
-            drawn where a ray meets nothing else. Left out altogether they would leave holes in masks.
+        opaque: whether all of it is opaque.
+        unlit: whether the base colour is shown without lighting.
+        two_sided: number of faces, the first ones, that are visible from both sides. Of the others only the outer side
+            is: of faces of closed solids, and of faces that coincide with one of opposite winding.
+        culled: whether the inner sides of its faces hide nothing, as for glTF's one-sided materials: they are drawn
+            where a ray hits nothing else. Without them there would be holes in masks.
     """
 
     positions: Floats
@@ -121,19 +120,19 @@ class ShadedSurface:
 
 
 def shaded_surfaces(parts: Sequence[trimesh.Trimesh], name: str = "object") -> list[ShadedSurface]:
-    """Bring the parts of an object into the form that the renderers draw.
+    """Convert the parts of an object for the renderers.
 
     Args:
-        parts: meshes in world coordinates. One whose `metadata["smooth"]` is true, or not there, is shaded smoothly,
-            but face colours are drawn flat in any case. One whose `metadata["closed"]` is true is taken for closed;
-            the inner sides of one whose `metadata["one_sided"]` is true hide nothing.
-        name: what to call the object in errors.
+        parts: meshes in world coordinates. Shading is smooth unless `metadata["smooth"]` is false or there are face
+            colours. `metadata["closed"]` marks closed meshes; inner sides of meshes with `metadata["one_sided"]` hide
+            nothing.
+        name: name of the object in errors.
 
     Returns:
-        One surface a part, in order; parts without faces are left out.
+        One surface per part, in order; parts without faces are left out.
 
     Raises:
-        RenderError: if a face's vertex is not finite, a texture has no coordinates, a material is of an unknown kind,
+        RenderError: if a face's vertex is not finite, a texture has no coordinates, a material is of an unknown type,
             or no part has a face.
     """
     images: dict[Any, npt.NDArray[np.uint8]] = {}
@@ -147,10 +146,10 @@ def shaded_surfaces(parts: Sequence[trimesh.Trimesh], name: str = "object") -> l
 
 
 def _one_side_where_doubled(surfaces: list[ShadedSurface]) -> list[ShadedSurface]:
-    """Surfaces in which faces that lie on another one, wound the other way round, come last and count as one-sided.
+    """Surfaces whose faces that coincide with one of opposite winding come last and count as one-sided.
 
-    Nearly every face of ShapeNet's models is there twice, often with two materials: the side that faces the camera is
-    the one that is meant. Faces count as the same where their corners agree to a tenth of COINCIDENT.
+    Nearly every face of ShapeNet's models exists twice, often with two materials: the one that faces the camera should
+    be visible. Faces are equal if their corners agree to a tenth of COINCIDENT.
     """
     if not any(surface.two_sided for surface in surfaces):
         return surfaces
@@ -171,10 +170,10 @@ def _one_side_where_doubled(surfaces: list[ShadedSurface]) -> list[ShadedSurface
 def _identified(
     positions: Floats, faces: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
-    """A number a face that depends on the places of its corners alone, and in which sense it goes through them."""
+    """A hash of each face by the positions of its corners in any order, and its orientation."""
     cells = np.rint(positions * (10.0 / COINCIDENT)).astype(np.int64).astype(np.uint64)
     mixed = cells[:, 0] * np.uint64(0x9E3779B97F4A7C15)
-    for column in (1, 2):  # multiply and shift: near places get unrelated numbers
+    for column in (1, 2):  # multiply and shift, so that near positions get unrelated numbers
         mixed = ((mixed ^ (mixed >> np.uint64(29))) + cells[:, column]) * np.uint64(0xBF58476D1CE4E5B9)
     mixed ^= mixed >> np.uint64(32)
     a, b, c = mixed[faces].T
@@ -233,7 +232,7 @@ def _surface(mesh: trimesh.Trimesh, where: str, images: dict[Any, Any]) -> Shade
 
 
 def _unit(vectors: Floats) -> Floats:
-    """Vectors of length 1; zero where the input has no direction."""
+    """Unit vectors; zero for inputs without direction."""
     vectors = np.where(np.isfinite(vectors).all(axis=1, keepdims=True), vectors, 0.0)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 1e-12)
@@ -242,7 +241,7 @@ def _unit(vectors: Floats) -> Floats:
 def _texture_coordinates(
     mesh: trimesh.Trimesh, material: dict[str, Any], where: str
 ) -> tuple[Floats | None, Floats | None]:
-    """Coordinates of the base colour texture, and those of the emissive texture where they are others."""
+    """Coordinates of the base colour texture, and those of the emissive texture if they differ."""
     if material["texture"] is None and material["emissive_texture"] is None:
         return None, None
     texture = texture_of(mesh)
@@ -303,7 +302,7 @@ def _is_opaque(texture: npt.NDArray[np.uint8] | None) -> bool:
 
 
 def _texels(image: Any, images: dict[Any, Any], *, keep_alpha: bool) -> npt.NDArray[np.uint8] | None:
-    """Premultiplied RGBA of a PIL image; equal images of an object share one array."""
+    """Premultiplied RGBA of a PIL image; equal images of an object share an array."""
     if image is None:
         return None
     rgba = image.convert("RGBA" if keep_alpha else "RGB").convert("RGBA")

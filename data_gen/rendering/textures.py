@@ -1,6 +1,6 @@
-"""Trilinear texture sampling in NumPy, as OpenGL does it: mipmaps, bilinear in a level, repeated, clamped or mirrored.
+"""Trilinear texture sampling in NumPy as in OpenGL: mipmaps, bilinear per level, repeated, clamped or mirrored.
 
-trimesh's `uv_to_interpolated_color` has no mipmaps: it skips texels of a texture that is small in the picture.
+trimesh's `uv_to_interpolated_color` has no mipmaps: it skips texels of textures that are small in the picture.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ class MipmappedTexture:
         self._starts = np.concatenate(([0], np.cumsum(self._sizes.prod(axis=1))[:-1]))
 
     def sample(self, uv: npt.NDArray[np.float64], level: npt.NDArray[np.float64]) -> Singles:
-        """Look texels up.
+        """Sample the texture.
 
         Args:
             uv: coordinates `(point, 2)`, v upwards.
-            level: binary logarithm `(point,)` of the texels between neighbouring samples; 0 and less is full size.
+            level: binary logarithm `(point,)` of the texels between neighbouring samples; full size at 0 and below.
 
         Returns:
-            RGBA `(point, 4)` in [0, 1], as the texture holds it.
+            RGBA `(point, 4)` in [0, 1], encoded as in the texture.
         """
         level = np.clip(level, 0.0, len(self._sizes) - 1.0)
         low = np.floor(level).astype(np.int64)
@@ -74,7 +74,7 @@ class MipmappedTexture:
 
 
 def _into(coordinates: npt.NDArray[np.float64], wrap: Wrap) -> npt.NDArray[np.float64]:
-    """Coordinates in [0, 1] of the texels that are seen at any coordinates."""
+    """Coordinates wrapped into [0, 1]."""
     if wrap == "clamp":
         return np.clip(coordinates, 0.0, 1.0)
     if wrap == "mirror":

@@ -25,8 +25,8 @@ __all__ = [
     "spiral",
 ]
 
-_BLENDER_FIELD_OF_VIEW = math.degrees(2.0 * math.atan(36.0 / 2.0 / 50.0))  # a lens of 50 mm before a film of 36 mm
-_SRN_FIELD_OF_VIEW = math.degrees(2.0 * math.atan(128.0 / 2.0 / 131.25))  # a focal length of 131.25 of 128 pixels
+_BLENDER_FIELD_OF_VIEW = math.degrees(2.0 * math.atan(36.0 / 2.0 / 50.0))  # a 50 mm lens and a 36 mm sensor
+_SRN_FIELD_OF_VIEW = math.degrees(2.0 * math.atan(128.0 / 2.0 / 131.25))  # a focal length of 131.25 pixels at 128
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class RigPreset:
 
     Attributes:
         kind: the same poses for every object, random ones for each, anywhere on the sphere, or a spiral.
-        views: cameras an object.
+        views: cameras per object.
         resolution: pixels along a side.
         distance: of the cameras from the origin, in world units.
         field_of_view: full angle in degrees; None fits the unit sphere.
@@ -56,12 +56,12 @@ RIG_PRESETS: dict[str, RigPreset] = {
 """The cameras of the paper's two data sets, and those of the test objects of SRN.
 
 `paper-128` follows the ShapeNet renders of "Learned Initializations" (Tancik et al. 2021), the paper's first data set:
-at random all over the sphere, at distance 4 (its loaders sample rays from 2 to 6), with Blender's field of view; the
+random poses on the whole sphere, at distance 4 (its loaders sample rays from 2 to 6), with Blender's field of view; the
 unit sphere spans 72 % of the picture. `paper-200` is the paper's second: the same 50 poses for every object. The
-paper does not say where they stand; its loader assumes a focal length of 277.77 pixels, which is the same field of
-view, near 2 and far 6.
+paper does not state the poses; its loader assumes a focal length of 277.77 pixels, which is the same field of view,
+near 2 and far 6.
 
-`srn` follows the test cars of "Scene Representation Networks" (Sitzmann et al. 2019), by which pixelNeRF and Splatter
+`srn` follows the test cars of "Scene Representation Networks" (Sitzmann et al. 2019), on which pixelNeRF and Splatter
 Image are compared: 251 views of 128x128 on an Archimedean spiral (`spiral`), 1.3 from the centre of a car whose sphere
 has a radius of a half, with a focal length of 131.25 pixels.
 """
@@ -82,7 +82,7 @@ def make_rig(
     """The cameras of a named rig.
 
     Args:
-        name: one of RIGS; of a preset only the kind is taken, all its numbers are arguments here.
+        name: one of RIGS; a preset only gives the kind, its numbers are arguments here.
         views: number of views.
         resolution: pixels along a side.
         seed: seed of random rigs.
@@ -93,7 +93,7 @@ def make_rig(
         The rig.
 
     Raises:
-        ValueError: if no rig has that name, or a number makes no sense.
+        ValueError: if the name is unknown or a number is invalid.
     """
     kind = RIG_PRESETS[name].kind if name in RIG_PRESETS else name
     lens = {"distance": distance, "field_of_view": field_of_view}

@@ -1,4 +1,4 @@
-"""Where the cameras of a rig stand: fixed places, random ones, a circle, a spiral."""
+"""Camera positions of rigs: fixed, random, a circle, a spiral."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from data_gen.rigs.rig import DEFAULT_DISTANCE, Array, Rig, aimed
 __all__ = ["fixed", "orbit", "random", "spiral"]
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
-_SPIRAL_ANGLE = 20.0  # radians about the vertical axis from the horizon to the pole, as SRN's renderer has it
+_SPIRAL_ANGLE = 20.0  # radians about the vertical axis from the horizon to the pole, as in SRN's renderer
 
 
 def fixed(
@@ -21,12 +21,12 @@ def fixed(
     distance: float = DEFAULT_DISTANCE,
     field_of_view: float | None = None,
 ) -> Rig:
-    """The same well spread poses for every object.
+    """The same evenly spread poses for every object.
 
     Views with an even index (support) and with an odd index (query) are each a spherical Fibonacci spread over the
-    elevations from -20 to 80 degrees, and their union is well spread too: the second spread stands half a step higher
-    and is turned into the gaps of the first. Within each half, views come in farthest-first order, so the first few are
-    well spread as well. Of 50 views, no two are nearer than 15.6 degrees, and no two of a half nearer than 29 degrees.
+    elevations from -20 to 80 degrees, and their union is well spread, too: the second spread is half a step higher and
+    rotated into the gaps of the first. Within each half, views are in farthest-first order, so the first few are well
+    spread as well. Of 50 views, no two are closer than 15.6 degrees, and no two of a half closer than 29 degrees.
 
     The arguments are those of `make_rig`.
     """
@@ -57,7 +57,7 @@ def random(
     Elevations are at least `lowest` degrees (0 for the upper hemisphere); the other arguments are those of `make_rig`.
 
     Raises:
-        ValueError: if `lowest`, or an argument of `make_rig`, makes no sense.
+        ValueError: if `lowest`, or an argument of `make_rig`, is invalid.
     """
     _check_views(views)
     if not -90.0 <= lowest < 90.0:
@@ -78,11 +78,11 @@ def orbit(
 ) -> Rig:
     """Cameras evenly around the object at one height: a turntable.
 
-    The first is in the direction of +z, all are `elevation` degrees over the horizon; the other arguments are those of
+    The first is in the direction of +z, all are `elevation` degrees above the horizon; the other arguments are those of
     `make_rig`.
 
     Raises:
-        ValueError: if the number of views, elevation, distance or resolution make no sense.
+        ValueError: if the number of views, elevation, distance or resolution is invalid.
     """
     _check_views(views)
     if not -90.0 <= elevation <= 90.0:
@@ -101,7 +101,7 @@ def spiral(
 ) -> Rig:
     """Cameras on an Archimedean spiral over the upper hemisphere, from the horizon to the pole.
 
-    Elevations grow by equal steps, 90 degrees in all, while the azimuth turns by 20 radians, as in the renderings of
+    Elevations grow in equal steps to 90 degrees, while the azimuth turns by 20 radians, as in the renderings of
     SRN's test objects (Sitzmann et al. 2019); the arguments are those of `make_rig`.
     """
     _check_views(views)

@@ -4,8 +4,8 @@ Conventions: OpenCV camera axes (x right, y down, z forward), a world with y up,
 in pixels with INTEGER pixel centres, so a centred principal point is `((W - 1) / 2, (H - 1) / 2)`. Objects are
 expected inside the sphere of radius 1 around the origin, at which every camera looks.
 
-A rig is numpy, and `Rig.cameras` makes Kornia cameras of it: worker processes, which import everything else of a rig,
-take 0.7 s of processor time to start, and importing torch and Kornia would add 1.4 s to each.
+A rig uses NumPy alone, and `Rig.cameras` makes Kornia cameras of it: worker processes take 0.7 s of processor time to
+start, and importing torch and Kornia would add 1.4 s to each.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Rig:
         width: image width in pixels.
         height: image height in pixels.
         near: distance along a ray before which there is no object, in world units.
-        far: distance along a ray after which there is no object, in world units.
+        far: distance along a ray beyond which there is no object, in world units.
 
     Raises:
         ValueError: if a shape is wrong, a number is not finite, a pose is not a rigid motion, or near and far are out
@@ -91,11 +91,11 @@ class Rig:
         return len(self.world_from_camera)
 
     def cameras(self, views: Sequence[int] | slice = slice(None), dtype: torch.dtype | None = None) -> PinholeCamera:
-        """The cameras as `hyperplanes.geometry` takes them.
+        """The cameras for `hyperplanes.geometry`.
 
         Args:
-            views: which of them; all by default.
-            dtype: of their numbers; float64 by default.
+            views: a selection; all by default.
+            dtype: of the cameras; float64 by default.
 
         Returns:
             A batch of Kornia cameras.
@@ -118,7 +118,7 @@ def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:
         The full angle in degrees, `2 asin(1.04 / distance)`.
 
     Raises:
-        ValueError: if the camera is too near for any angle to do, or infinitely far.
+        ValueError: if the camera is too near for any angle, or infinitely far.
 
     >>> round(fitting_field_of_view(3.0), 3)
     40.567
@@ -132,14 +132,14 @@ def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:
 def look_at_origin(centres: npt.ArrayLike) -> Array:
     """Poses of cameras that look at the origin with the world's y axis up in the picture.
 
-    The poses of `hyperplanes.geometry.poses.look_at`, in numpy and exact at the centres; a test compares the two.
+    As `hyperplanes.geometry.poses.look_at`, in NumPy and with exact centres; a test compares the two.
 
     Args:
         centres: camera positions `(view, 3)`, none of them the origin.
 
     Returns:
-        `world_from_camera` `(view, 4, 4)`, OpenCV axes. Right above or below the origin, where no direction is up,
-        the world's z axis is up in the picture.
+        `world_from_camera` `(view, 4, 4)`, OpenCV axes. Vertically above or below the origin, the world's z
+        axis is up in the picture.
 
     >>> look_at_origin([[0.0, 0.0, 3.0]])[0].round().astype(int).tolist()
     [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]]
@@ -155,11 +155,11 @@ def look_at_origin(centres: npt.ArrayLike) -> Array:
     poses[:, :3, 2] = forward
     poses[:, :3, 3] = positions
     poses[:, 3, 3] = 1.0
-    return poses + 0.0  # no negative zeros in what is written to disk
+    return poses + 0.0  # no negative zeros on disk
 
 
 def aimed(directions: Array, resolution: int, distance: float, field_of_view: float | None) -> Rig:
-    """Cameras that look at the origin from some directions (view, 3); the other arguments are those of `make_rig`."""
+    """Cameras that look at the origin from given directions (view, 3); other arguments as in `make_rig`."""
     if resolution < 1:
         raise ValueError(f"resolution: expected at least 1 pixel, received {resolution}")
     fitting = fitting_field_of_view(distance)

@@ -1,7 +1,7 @@
-"""An endless supply of procedural, ShapeNet-like objects: `make(class_name, seed)` is always the same scene.
+"""An endless supply of procedural, ShapeNet-like objects: `make(class_name, seed)` always gives the same scene.
 
-Frame: y up, front along +z (so +x is the object's left); a `random` composition has neither. Units are metres and the
-origin lies wherever the object stands or balances; whoever renders them normalises.
+Frame: y up, front along +z (so +x is the object's left); `random` compositions have neither. Units are metres, and the
+origin lies wherever the object stands or balances; rendering normalises objects.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from hyperplanes.utilities.errors import did_you_mean
 __all__ = ["CLASSES", "ONE_SIDED", "assemble", "check_class", "find_classes", "make"]
 
 CLASSES: tuple[str, ...] = ("car", "chair", "plane", "lamp", "random")
-"""Names of the classes of this package; the position of a name is part of its objects' seed, so the order is fixed."""
+"""Names of the classes of this package; the position of a name is part of its objects' seeds, so the order is fixed."""
 
 ONE_SIDED: tuple[str, ...] = ("car", "chair", "plane", "lamp")
-"""Classes whose solids never cross themselves, so that nobody sees their inner sides: those need not be drawn."""
+"""Classes whose solids never intersect themselves, so that inner sides are never visible and need not be drawn."""
 
 _MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
     "car": car,
@@ -39,19 +39,19 @@ _MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
 
 
 def find_classes() -> dict[str, Callable[[np.random.Generator], list[Part]]]:
-    """What makes the objects of each class: those of this package, then those of other packages that are installed.
+    """The functions that make objects of each class: those of this package, then those of other installed packages.
 
-    Another package adds a class by an entry point of the group `data_gen.shapes` that names such a function: it draws
-    all that is random from the generator and returns painted solids in metres, y up, front along +z.
+    Another package adds a class by an entry point of the group `data_gen.shapes` that names such a function: it takes
+    all randomness from the generator and returns painted solids in metres, y up, front along +z.
     """
     return _MAKERS | load_entries("data_gen.shapes", _MAKERS)
 
 
 def check_class(class_name: str) -> None:
-    """Refuse a name of no class.
+    """Check the name of a class.
 
     Raises:
-        ValueError: such a name, with the classes that there are and the nearest one.
+        ValueError: an unknown name; the message has all classes and the nearest one.
     """
     known = find_classes()
     if class_name not in known:
@@ -87,7 +87,7 @@ def make(class_name: str, seed: int) -> trimesh.Scene:
         seed: any non-negative integer; the same one gives the same vertices, faces and pixels.
 
     Returns:
-        A scene with one textured geometry a finish, the first named after the class: metres, y up, front along +z. Its
-        `metadata["parts"]` lists (part name, first face, number of faces).
+        A scene with one textured geometry per finish, the first named after the class: metres, y up, front along +z.
+        Its `metadata["parts"]` lists (part name, first face, number of faces).
     """
     return build_scene(class_name, assemble(class_name, seed))

@@ -1,4 +1,4 @@
-"""What the parts are painted with: plain colours and small procedural textures.
+"""Materials of parts: plain colours and small procedural textures.
 
 Colours are sRGB, 0 to 255. A `Material` is an image; a plain colour is an image of one pixel. Patterns are drawn with a
 `numpy.random.Generator`, so the same generator state gives the same pixels.
@@ -21,7 +21,7 @@ class Material:
     """A painted surface.
 
     Attributes:
-        name: what it is called.
+        name: name of the material.
         image: pixels (h, w, 3), uint8 sRGB, row 0 at the top (v = 1). One pixel for a plain colour.
     """
 
@@ -30,12 +30,12 @@ class Material:
 
 
 def plain(colour: Colour, name: str = "plain") -> Material:
-    """One colour all over."""
+    """A single colour."""
     return Material(name, np.array([[colour]], dtype=np.uint8))
 
 
 def brighten(colour: Colour, factor: float) -> Colour:
-    """A colour times a factor, which below 1 darkens it, clipped to the range."""
+    """A colour times a factor, clipped to the range; factors below 1 darken it."""
     red, green, blue = (min(255, max(0, round(channel * factor))) for channel in colour)
     return red, green, blue
 

@@ -1,8 +1,8 @@
-"""Painted solids, and the scene they make together.
+"""Painted solids, and scenes made of them.
 
-All parts of one finish end in ONE geometry, and all geometries share ONE texture: a draw call costs a renderer more
-than the faces of a wheel do. The texture is an atlas. A plain colour is a block of it, read at the block's centre by
-all corners of a face, so nothing bleeds in at any distance; a pattern is a tile with its border repeated outwards.
+All parts of one finish are ONE geometry, and all geometries share ONE texture: a draw call costs a renderer more than
+the faces of a wheel. The texture is an atlas. A plain colour is a block of it, read at the block's centre by all
+corners of a face, so nothing bleeds in at any distance; a pattern is a tile with its border repeated outwards.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class Part:
     """A solid with a material on each face.
 
     Attributes:
-        name: what it is: "wheel", "left_wing".
+        name: such as "wheel" or "left_wing".
         solid: the geometry, in the object's frame.
         materials: the materials used.
         chosen: (F,) index into `materials` of each face.
-        finish: how all of it reflects.
+        finish: how the whole part reflects.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Part:
         return self.painted((cells[:, 0] == -1) & np.where(cells[:, 1] == 0, first, last), material)
 
     def mirrored(self) -> Part:
-        """The part reflected in the plane x = 0, "left" in its name become "right"."""
+        """The part reflected in the plane x = 0, with "left" in its name replaced by "right"."""
         return replace(self, name=self.name.replace("left", "right"), solid=self.solid.mirrored())
 
 
@@ -81,7 +81,7 @@ def pair(*parts: Part) -> list[Part]:
 
 
 def pick(rng: np.random.Generator, shares: Mapping[str, float]) -> str:
-    """One of the names, each as often as its share of all shares."""
+    """A random name, with probabilities proportional to the shares."""
     weights = np.array(list(shares.values()))
     return list(shares)[int(rng.choice(len(weights), p=weights / weights.sum()))]
 
@@ -125,7 +125,7 @@ def corner_normals(solids: Sequence[Solid]) -> np.ndarray:
     """Shading normals (F, 3, 3) of the corners of all faces of several solids, which share no vertex.
 
     A corner takes the area-weighted mean of the faces around its vertex whose normals are within `solid.crease`
-    degrees of its own face's. All solids at once: many small arrays take longer.
+    degrees of its own face's. All solids are processed at once: many small arrays would take longer.
     """
     starts = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     vertices = np.concatenate([solid.vertices for solid in solids])
@@ -138,7 +138,7 @@ def corner_normals(solids: Sequence[Solid]) -> np.ndarray:
     around = np.argsort(flat, kind="stable")  # corners by their vertex
     count = np.bincount(flat, minlength=len(vertices))
     first = np.cumsum(count) - count
-    # Every pair of corners at one vertex: the corner that asks, and the face that is asked.
+    # Every pair of corners at one vertex: a corner, and a face that may contribute to its normal.
     pairs = count[flat]
     corner = np.repeat(np.arange(len(flat)), pairs)
     turn = np.arange(len(corner)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
@@ -151,10 +151,10 @@ def corner_normals(solids: Sequence[Solid]) -> np.ndarray:
 
 
 def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The different rows (m, k) of integers (n, k), in the order in which they come first, and which each row is."""
+    """The distinct rows (m, k) of integers (n, k) in order of first occurrence, and the index of each row."""
     keys = (rows * np.random.default_rng(0).integers(1, 2**62, rows.shape[1])).sum(axis=1)  # wraps around
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    if not np.array_equal(rows[first][inverse], rows):  # two rows with one key
+    if not np.array_equal(rows[first][inverse], rows):  # a collision of keys
         _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)
@@ -163,10 +163,10 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build_scene(name: str, parts: Sequence[Part]) -> trimesh.Scene:
-    """Join parts into a scene with one textured geometry a finish.
+    """Join parts into a scene with one textured geometry per finish.
 
     Args:
-        name: name of the first geometry; the others have a number behind it.
+        name: name of the first geometry; the others have a number after it.
         parts: the painted solids.
 
     Returns:
@@ -196,7 +196,7 @@ def build_scene(name: str, parts: Sequence[Part]) -> trimesh.Scene:
 
 
 def _key(material: Material) -> bytes:
-    """What two materials share if and only if they look the same."""
+    """A key that is equal for two materials if and only if they look the same."""
     return repr(material.image.shape).encode() + material.image.tobytes()
 
 
@@ -207,7 +207,7 @@ def _joined(
     positions, coordinates, names, first = [], [], [], 0
     for part in parts:
         solid = part.solid
-        row = np.array([rows.get(_key(each), 0) for each in part.materials])  # 0 where no face has it
+        row = np.array([rows.get(_key(each), 0) for each in part.materials])  # 0 if no face uses it
         mapping = maps[row[part.chosen]]  # (F, 2, 2)
         coordinates.append(solid.uv * mapping[:, None, :, 0] + mapping[:, None, :, 1])
         positions.append(solid.vertices[solid.faces])

@@ -1,7 +1,7 @@
 """Watertight solids with a known volume: lofts, lathes and sweeps.
 
-A `Solid` carries its exact volume, computed from the numbers that define it and not from its triangles, so that a
-tear or a reversed face shows up as a difference between the two. Right-handed axes, y up. Faces are counter-clockwise
+A `Solid` has its exact volume, computed from its parameters and not from its triangles, so that holes or reversed faces
+show up as a difference between the two. Right-handed axes, y up. Faces are counter-clockwise
 seen from outside.
 """
 

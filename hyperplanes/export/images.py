@@ -88,7 +88,7 @@ def encode_animation(frames: npt.NDArray[np.uint8], kind: str = "webp", seconds:
     if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or not frames.size:
         raise ValueError(
             f"frames: expected 8-bit pixels (frame, height, width, 3), got {frames.dtype} {frames.shape}; "
-            "`to_pixels` makes them of images"
+            "`to_pixels` converts images"
         )
     if not 0 < seconds < math.inf:
         raise ValueError(f"seconds: expected a time above 0, got {seconds}")
@@ -217,7 +217,7 @@ def orbit_cameras(
         ValueError: a count or size below 1, or no views.
     """
     if not len(views):
-        raise ValueError("views: expected at least one to take the lens and the distance of, got none")
+        raise ValueError("views: expected at least one, for lens and distance, got none")
     if count < 1:
         raise ValueError(f"count: expected at least one camera, got {count}")
     if size is not None and size < 1:

@@ -71,7 +71,7 @@ def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, coun
     surface = seen_surface(pictures, cameras)
     opaque = (surface.covered > 0) & (pictures.opacity[:, 0] >= OPAQUE)
     if not opaque.any():
-        raise ValueError("pictures: expected something opaque, got pictures in which nothing is; train longer")
+        raise ValueError("pictures: expected opaque pixels, got none; train longer")
     points, normals = surface.points[opaque], surface.normals[opaque]
     colours = pictures.images.permute(0, 2, 3, 1)[opaque].clamp(0, 1)
     values = torch.cat([points, normals, colours], 1).cpu()
@@ -79,7 +79,7 @@ def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, coun
     found = PointCloud(values[:, :3], torch.nn.functional.normalize(values[:, 3:6], dim=-1), values[:, 6:])
     kept = _is_confirmed(found.points, surface.z.cpu(), camera.to(cameras, "cpu", torch.float32), bounds)
     if not kept.any():
-        raise ValueError(f"count: expected more points, got {count}, so few that none of their means is on the surface")
+        raise ValueError(f"count: expected more points, got {count}, whose means all lie off the surface")
     return PointCloud(found.points[kept], found.normals[kept], found.colours[kept])
 
 

@@ -246,7 +246,7 @@ def turning_radius(distortion: Float[Tensor, "view coefficient"]) -> Float[Tenso
     Returns:
         In units of the focal length, float64; infinite where there is none.
 
-    >>> turning_radius(torch.tensor([[-1 / 3, 0.0, 0.0, 0.0, 0.0]])).tolist()
+    >>> turning_radius(torch.tensor([[-1 / 3, 0.0, 0.0, 0.0, 0.0]])).round(decimals=6).tolist()
     [1.0]
     """
     radii = []

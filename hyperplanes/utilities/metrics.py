@@ -35,7 +35,7 @@ def pooled_psnr(
     Images of different shapes are a ValueError.
 
     >>> truth = torch.zeros(2, 3, 4, 4)
-    >>> pooled_psnr(truth + torch.tensor([0.1, 0.0]).view(2, 1, 1, 1), truth).round(decimals=2).item()
+    >>> round(pooled_psnr(truth + torch.tensor([0.1, 0.0]).view(2, 1, 1, 1), truth).item(), 2)
     23.01
     """
     _check(predicted, truth)

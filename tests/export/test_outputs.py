@@ -98,7 +98,7 @@ def test_what_other_views_look_through_is_no_point(pictures):
     spoilt = Pictures(pictures.images, opacity, depth, 0)
     kept = point_cloud(spoilt, CAMERAS, Sphere()).points.norm(dim=-1)
     assert float(kept.max()) < RADIUS + 0.06
-    with pytest.raises(ValueError, match="pictures: expected something opaque"):
+    with pytest.raises(ValueError, match="pictures: expected opaque pixels"):
         point_cloud(Pictures(pictures.images, 0 * opacity, depth, 0), CAMERAS, Sphere())
-    with pytest.raises(ValueError, match="count: expected more points, got 1, so few"):
+    with pytest.raises(ValueError, match="count: expected more points, got 1, whose means"):
         point_cloud(pictures, CAMERAS, Sphere(), 1)

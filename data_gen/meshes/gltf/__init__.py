@@ -1,4 +1,4 @@
-"""glTF 2 and GLB files: container and checks, accessors, materials, primitives, and the scene they make; and back."""
+"""glTF 2 and GLB files: container and checks, accessors, materials, primitives, scenes; reading and writing."""
 
 from data_gen.meshes.gltf.read import read_gltf
 from data_gen.meshes.gltf.write import write_glb

@@ -18,10 +18,10 @@ _MAX_SPARSE_BYTES = 1 << 27
 
 
 def check_accessors(document: Document) -> None:
-    """Check that each accessor lies inside its buffer view, so that nothing is allocated that the file cannot fill.
+    """Check that each accessor lies inside its buffer view, so that no more is allocated than the file can fill.
 
     Raises:
-        MeshError: if one does not, or has neither data nor, as compressed ones, an extension that gives them.
+        MeshError: if one does not, or has neither data nor an extension with compressed data.
     """
     compressed = _compressed_accessors(document)
     for index, accessor in enumerate(document.items("accessors")):
@@ -56,7 +56,7 @@ def _check_block(document: Document, block: dict[str, Any], count: Any, item: in
 
 
 def _compressed_accessors(document: Document) -> set[int]:
-    """Numbers of the accessors whose data is in a compressed block."""
+    """Indices of the accessors whose data is in a compressed block."""
     found: set[int] = set()
     for mesh in document.items("meshes"):
         for primitive in mesh["primitives"]:
@@ -70,13 +70,13 @@ def _dtype(accessor: dict[str, Any]) -> np.dtype[Any]:
 
 
 def read_accessor(document: Document, index: int) -> npt.NDArray[Any]:
-    """The items of an accessor, which was checked, as the file holds them.
+    """The items of a checked accessor, as stored in the file.
 
     Returns:
         Its items `(item, column)`; `(item,)` for scalars.
 
     Raises:
-        MeshError: if it has no data, or a sparse one changes an item that it does not have.
+        MeshError: if it has no data, or sparse indices out of range.
     """
     accessor = document.items("accessors")[not_negative(index)]
     count, dtype, columns = accessor["count"], _dtype(accessor), _COLUMNS[accessor["type"]]
@@ -99,7 +99,7 @@ def read_accessor(document: Document, index: int) -> npt.NDArray[Any]:
 
 
 def read_numbers(document: Document, index: int) -> npt.NDArray[np.float64]:
-    """The items of an accessor as numbers: normalised integers in [0, 1] or [-1, 1], others as they are."""
+    """The items of an accessor as numbers: normalised integers in [0, 1] or [-1, 1], others unchanged."""
     found = read_accessor(document, index)
     return as_numbers(found, normalised=bool(document.items("accessors")[index].get("normalized")))
 
@@ -121,7 +121,7 @@ def as_numbers(values: npt.NDArray[Any], *, normalised: bool) -> npt.NDArray[np.
 def _block(
     document: Document, block: dict[str, Any], count: int, dtype: np.dtype[Any], columns: int
 ) -> npt.NDArray[Any]:
-    """Items (item, column) at the offset and the stride of a buffer view."""
+    """Items (item, column) at the offset and stride of a buffer view."""
     view = document.items("bufferViews")[block["bufferView"]]
     item = dtype.itemsize * columns
     stride = view.get("byteStride", item)
@@ -129,4 +129,4 @@ def _block(
         return np.zeros((0, columns), dtype=dtype)
     data = np.frombuffer(document.view(block["bufferView"]), dtype=np.uint8, offset=block.get("byteOffset", 0))
     rows = np.lib.stride_tricks.as_strided(data, (count, item), (stride, 1), writeable=False)
-    return rows.copy().view(dtype)  # trimesh loses colours that it may not write to
+    return rows.copy().view(dtype)  # trimesh drops colours in read-only arrays

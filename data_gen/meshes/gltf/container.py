@@ -1,4 +1,4 @@
-"""The JSON and the buffers of a glTF or GLB file, read whole and checked before anything is made of them."""
+"""The JSON and the buffers of a glTF or GLB file, read completely and checked before use."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _DRAWN = {
     "KHR_materials_transmission",
     "KHR_texture_transform",
     "EXT_texture_webp",
-    # These change highlights, or nothing, of what is drawn here.
+    # These change nothing that is drawn here, or only highlights.
     "KHR_materials_ior",
     "KHR_materials_specular",
     "KHR_lights_punctual",
@@ -45,7 +45,7 @@ class Document:
         header: its JSON.
         buffers: the content of its buffers, each at least as long as declared.
         folder: gives the other files of the model, and names the file in messages.
-        warnings: receives what will not be drawn as the file states, by name.
+        warnings: receives a line for everything that will not be drawn as the file states.
     """
 
     header: dict[str, Any]
@@ -59,18 +59,18 @@ class Document:
         return self.folder.path
 
     def items(self, key: str) -> list[dict[str, Any]]:
-        """A list of the header, empty where it has none of this name."""
+        """A list of the header; empty if it has none of this name."""
         return self.header.get(key, [])
 
     def view(self, index: int) -> memoryview:
-        """The bytes of a buffer view, whose bounds were checked; not a copy."""
+        """The bytes of a buffer view with checked bounds; not a copy."""
         view = self.items("bufferViews")[not_negative(index)]
         start = view.get("byteOffset", 0)
         return memoryview(self.buffers[view["buffer"]])[start : start + view["byteLength"]]
 
 
 def not_negative(index: int) -> int:
-    """An index of the file; Python would count a negative one from the end.
+    """An index in the file, checked: Python would count a negative one from the end.
 
     Raises:
         IndexError: if it is negative.
@@ -81,13 +81,13 @@ def not_negative(index: int) -> int:
 
 
 def open_document(data: bytes, folder: ModelFolder) -> Document:
-    """Parse the container, GLB where the file is called so, check its extensions, and read its buffers.
+    """Parse the container (GLB by the file name), check its extensions, and read its buffers.
 
     Returns:
         The document; its buffer views lie inside their buffers.
 
     Raises:
-        MeshError: if the file was cut, a buffer is missing, or an extension that is needed is not supported.
+        MeshError: if the file was cut, a buffer is missing, or a required extension is not supported.
     """
     header, chunk = _glb(data, folder) if folder.path.suffix.lower() == ".glb" else (_json(data, folder), None)
     if not isinstance(header, dict):
@@ -102,7 +102,7 @@ def open_document(data: bytes, folder: ModelFolder) -> Document:
 
 
 def _check_extensions(header: dict[str, Any], folder: ModelFolder) -> list[str]:
-    """Warnings of extensions that are not drawn; a MeshError where the file cannot be read without one."""
+    """Warnings about extensions that are not drawn; a MeshError if one is required."""
     warnings = []
     used, required = set(header.get("extensionsUsed", [])), set(header.get("extensionsRequired", []))
     for name in sorted(used | required):
@@ -118,19 +118,19 @@ def _check_extensions(header: dict[str, Any], folder: ModelFolder) -> list[str]:
 
 
 def read_uri(uri: str, folder: ModelFolder, where: str, *, image: bool = False) -> bytes | None:
-    """The bytes that a URI of the file stands for: base64 data, or a file of the model.
+    """The bytes of a URI in the file: base64 data, or a file of the model.
 
     Args:
         uri: the URI.
         folder: gives the files.
-        where: what messages begin with.
-        image: whether it is a texture, which is decoded once.
+        where: start of messages.
+        image: whether it is a texture, which is decoded once as a check.
 
     Returns:
-        The bytes; None for a file that is not there or, of a texture, not whole.
+        The bytes; None for a missing file or a damaged texture.
 
     Raises:
-        MeshError: if the data is no base64, or the URI leads outside the model's folder or into the network.
+        MeshError: if the data is not base64, or the URI leads outside the model's folder or to the network.
     """
     if uri.startswith("data:"):
         _, _, text = uri.partition("base64,")

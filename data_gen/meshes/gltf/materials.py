@@ -1,7 +1,7 @@
-"""Materials and textures of a glTF file, as trimesh's PBRMaterial with what that class has no field for.
+"""Materials and textures of a glTF file, as trimesh's PBRMaterial with additional properties.
 
-The specular-glossiness workflow is converted by trimesh, from pictures of 8 bits a channel: trimesh itself gives it
-palette indices for grey values. What a transmissive surface lets through is drawn as opacity, without refraction.
+trimesh converts the specular-glossiness workflow, from images with 8 bits per channel: alone it would take palette
+indices for grey values. Transmission is drawn as opacity, without refraction.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ _CLEAREST = 0.1
 
 @dataclass(frozen=True)
 class TextureCoordinates:
-    """Where a texture takes its coordinates from.
+    """The source of a texture's coordinates.
 
     Attributes:
-        set: number of the attribute TEXCOORD_n.
-        transform: KHR_texture_transform as a matrix `(2, 3)` on (u, v, 1), v downwards; None for none.
+        set: number n of the attribute TEXCOORD_n.
+        transform: KHR_texture_transform as a matrix `(2, 3)` on (u, v, 1), v downwards, or None.
     """
 
     set: int = 0
     transform: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 
     def apply(self, uv: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """The coordinates `(vertex, 2)` after the transform, v downwards as before."""
+        """The transformed coordinates `(vertex, 2)`, v downwards as before."""
         if self.transform is None:
             return uv
         matrix = np.array(self.transform)
@@ -61,8 +61,8 @@ class GltfMaterial:
     """A material of the file.
 
     Attributes:
-        material: what is drawn.
-        base: coordinates of its base colour texture, or of its emissive texture where that is the only one.
+        material: the material to draw.
+        base: coordinates of its base colour texture, or of its emissive texture if that is the only one.
         emissive: coordinates of its emissive texture.
     """
 
@@ -72,17 +72,17 @@ class GltfMaterial:
 
 
 def read_materials(document: Document) -> list[GltfMaterial]:
-    """All materials of a file; what is lost of one is named in the document's warnings.
+    """All materials of a file; the document's warnings name what is lost.
 
     Returns:
-        The materials, plain factors linear. One whose base colour texture is lost is grey, where it would be white.
+        The materials, plain factors linear. White ones whose base colour texture is lost are grey.
     """
     textures = _Textures(document)
     return [_material(values, index, textures, document) for index, values in enumerate(document.items("materials"))]
 
 
 class _Textures:
-    """Decoded textures of a file, each picture once."""
+    """Decoded textures of a file, each image once."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
@@ -114,7 +114,7 @@ class _Textures:
         return PIL.Image.open(io.BytesIO(data), formats=IMAGE_FORMATS)
 
     def find(self, values: dict[str, Any], slot: str, label: str) -> PIL.Image.Image | None:
-        """The picture in a slot of a material; None without one, with a warning where it is lost."""
+        """The image in a slot of a material; None without one, with a warning if it is lost."""
         texture = self._texture(values, slot)
         if texture is None:
             if slot in values:
@@ -154,7 +154,7 @@ def _material(values: dict[str, Any], index: int, textures: _Textures, document:
     base_slot = "baseColorTexture"
     glossy = extensions.get(_SPECULAR_GLOSSINESS)
     for slot in _SLOTS:
-        # The file's other description of the same surface is not drawn, so nothing of it is lost.
+        # The other description of the same surface is not drawn, so losses in it do not matter.
         if glossy is None or slot not in ("baseColorTexture", "metallicRoughnessTexture"):
             keywords[slot] = textures.find(values, slot, label)
     if glossy is not None:
@@ -204,14 +204,14 @@ def _coordinates(reference: dict[str, Any]) -> TextureCoordinates:
 
 
 def _set_default_colour(material: DrawnMaterial) -> None:
-    """Grey for a white material whose texture is lost: white would not be seen over white."""
+    """Make a white material grey if its texture is lost: white would be invisible over white."""
     factor = material.baseColorFactor
     if factor is None or (np.asarray(factor)[:3] == 255).all():
         material.baseColorFactor = DEFAULT_COLOUR
 
 
 def _set_opacity(material: DrawnMaterial, transmission: float, label: str, document: Document) -> None:
-    """Opacity for transmission: what a clear surface lets through, one of any colour absorbs in part."""
+    """Replace transmission by opacity: clear surfaces transmit light, coloured ones absorb part of it."""
     factor = np.ones(4) if material.baseColorFactor is None else np.asarray(material.baseColorFactor) / 255.0
     colour = factor[:3]
     if material.baseColorTexture is not None:

@@ -20,7 +20,7 @@ __all__ = ["Skinning", "read_primitive"]
 
 Floats = npt.NDArray[np.float64]
 Skinning = Floats
-"""Matrices `(joint, 4, 4)` from the mesh's coordinates at rest to the scene's, as its joints stand."""
+"""Matrices `(joint, 4, 4)` from the mesh's rest coordinates to the scene's, in the pose of its joints."""
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _MODES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
@@ -38,18 +38,18 @@ def read_primitive(
     """Make a mesh of a primitive.
 
     Args:
-        document: the file, whose accessors were checked.
+        document: the file, with checked accessors.
         primitive: its JSON.
-        label: what to call it in a warning.
-        materials: the file's.
-        weights: of its morph targets; those that are missing count as 0.
-        skinning: the matrices of its joints, which then take the place of its node's transform.
+        label: its name in warnings.
+        materials: the materials of the file.
+        weights: of its morph targets; missing ones count as 0.
+        skinning: the matrices of its joints, which replace its node's transform.
 
     Returns:
-        The mesh, with `metadata["one_sided"]`; None for points and lines, of which a warning is left.
+        The mesh, with `metadata["one_sided"]`; None, with a warning, for points and lines.
 
     Raises:
-        MeshError: if its corners make no whole triangles, or compressed data cannot be read.
+        MeshError: if its corners are not whole triangles, or compressed data cannot be read.
     """
     mode = primitive.get("mode", _TRIANGLES)
     if mode not in (_TRIANGLES, _STRIP, _FAN):
@@ -83,7 +83,7 @@ def read_primitive(
 
 
 class _Attributes:
-    """The arrays of a primitive, from its accessors or from its compressed block."""
+    """The arrays of a primitive, from its accessors or its compressed block."""
 
     def __init__(self, document: Document, primitive: dict[str, Any], label: str) -> None:
         self._document, self._label = document, label
@@ -102,7 +102,7 @@ class _Attributes:
         return name in self._accessors
 
     def raw(self, name: str) -> npt.NDArray[Any]:
-        """Items of an attribute as the file holds them."""
+        """Items of an attribute as stored in the file."""
         if name not in self._decoded:
             return read_accessor(self._document, self._accessors[name])
         count = self._accessor(name)["count"]
@@ -114,16 +114,16 @@ class _Attributes:
         return self._decoded[name]
 
     def floats(self, name: str) -> npt.NDArray[Any]:
-        """Items of an attribute as numbers; float32 as they are."""
+        """Items of an attribute as numbers; float32 unchanged."""
         found = self.raw(name)
         return found if found.dtype.kind == "f" else self.numbers(name)
 
     def numbers(self, name: str) -> Floats:
-        """Items of an attribute as numbers, quantised ones as glTF defines them."""
+        """Items of an attribute as numbers, quantised ones decoded as glTF defines."""
         return as_numbers(self.raw(name), normalised=bool(self._accessor(name).get("normalized")))
 
     def warn(self, what: str) -> None:
-        """Leave a warning about the primitive."""
+        """Add a warning about the primitive."""
         self._document.warnings.append(f"{self._label}: {what}")
 
     def corners(self, vertices: int) -> npt.NDArray[np.int64]:
@@ -138,7 +138,7 @@ class _Attributes:
 def _decompress(
     document: Document, block: dict[str, Any], label: str
 ) -> tuple[dict[str, npt.NDArray[Any]], npt.NDArray[Any]]:
-    """Arrays by attribute, and the triangles, of a block that Draco compressed."""
+    """The arrays by attribute, and the triangles, of a Draco-compressed block."""
     try:
         import DracoPy
     except ImportError as error:
@@ -171,14 +171,14 @@ def _faces(corners: npt.NDArray[np.int64], mode: int, label: str, document: Docu
     if mode == _FAN:
         return np.stack((corners[1:-1], corners[2:], np.full(len(corners) - 2, corners[0])), axis=1)
     faces = np.stack((corners[:-2], corners[1:-1], corners[2:]), axis=1)
-    faces[1::2] = faces[1::2, [1, 0, 2]]  # every other triangle of a strip is wound the other way round
+    faces[1::2] = faces[1::2, [1, 0, 2]]  # every other triangle of a strip has the opposite winding
     return faces
 
 
 def _morph(
     attributes: _Attributes, primitive: dict[str, Any], weights: Sequence[float], keywords: dict[str, Any]
 ) -> None:
-    """Add the morph targets by their weights."""
+    """Add the weighted morph targets."""
     names = {"POSITION": "vertices", "NORMAL": "vertex_normals"}
     for weight, target in zip(weights, primitive.get("targets", []), strict=False):
         for name, keyword in names.items():
@@ -222,7 +222,7 @@ def _visual(attributes: _Attributes, material: GltfMaterial, colours: npt.NDArra
 
 
 def _uv(attributes: _Attributes, coordinates: TextureCoordinates) -> Floats | None:
-    """Coordinates with v upwards, as trimesh has them."""
+    """Coordinates with v upwards, as in trimesh."""
     name = f"TEXCOORD_{coordinates.set}"
     if name not in attributes:
         return None

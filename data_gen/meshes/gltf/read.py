@@ -1,8 +1,8 @@
-"""Reads glTF and GLB files: the meshes of a scene where their nodes, skins and instances put them.
+"""Reads glTF and GLB files: the meshes of a scene, placed by nodes, skins and instances.
 
-trimesh's reader takes the first texture coordinates for all, draws every texture repeated, ignores morph weights,
-skins, instances and quantisation, decodes pictures that do not fit into memory, and loses what it cannot read without
-a warning. Here trimesh holds the result.
+trimesh's reader uses the first texture coordinates for all textures, repeats every texture, ignores morph weights,
+skins, instances and quantisation, decodes images that do not fit into memory, and silently loses what it cannot read.
+Here trimesh only holds the result.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _WORLD = "world"
 
 
 def read_gltf(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSpace, list[str]]:
-    """Read a glTF file, or a GLB file where it is called so, whose buffers and textures have been checked.
+    """Read a glTF or, by its name, GLB file, with checks of its buffers and textures.
 
     Returns:
-        Its scene; what its plain colours are (trimesh writes vertex colours as it holds them, sRGB); and warnings that
-        name what will not be drawn as the file states.
+        Its scene; the colour space of its plain colours (trimesh writes vertex colours as sRGB); and warnings about
+        what will not be drawn as the file states.
 
     Raises:
-        MeshError: if the file was cut, is malformed, or needs what is not supported.
+        MeshError: if the file was cut, is malformed, or requires unsupported features.
     """
     try:
         document = open_document(data, folder)
@@ -53,7 +53,7 @@ def read_gltf(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, ColourSp
 
 
 class _SceneReader:
-    """Makes a trimesh.Scene of the nodes of a document."""
+    """Makes a trimesh.Scene from the nodes of a document."""
 
     def __init__(self, document: Document, materials: list[GltfMaterial]) -> None:
         self._document, self._materials = document, materials
@@ -78,7 +78,7 @@ class _SceneReader:
         return self._scene
 
     def _edges(self) -> list[tuple[Any, int, npt.NDArray[np.float64]]]:
-        """Frames, the nodes below them and their transforms, a parent before its children."""
+        """Frames, their child nodes and transforms, parents first."""
         document = self._document
         scenes = document.items("scenes")
         roots = scenes[not_negative(document.header.get("scene", 0))].get("nodes", []) if scenes else []
@@ -103,7 +103,7 @@ class _SceneReader:
     def _geometries(
         self, mesh: dict[str, Any], index: int, weights: Any = None, skinning: Skinning | None = None
     ) -> list[str]:
-        """Names of the geometries that the primitives of a mesh become."""
+        """Names of the geometries made from the primitives of a mesh."""
         label = mesh.get("name") or f"mesh {index}"
         names = []
         for primitive in mesh["primitives"]:
@@ -122,7 +122,7 @@ class _SceneReader:
         return names
 
     def _place(self, node: dict[str, Any]) -> None:
-        """Put the mesh of a node into the scene: once, moved by its skin, or as often as its instances say."""
+        """Place the mesh of a node in the scene: once, deformed by its skin, or once per instance."""
         index = not_negative(node["mesh"])
         mesh = self._document.items("meshes")[index]
         names, frame = self._plain[index], node["index"]
@@ -166,7 +166,7 @@ class _SceneReader:
 
 
 def _matrix(node: dict[str, Any]) -> npt.NDArray[np.float64]:
-    """The transform of a node: its matrix, or translation, rotation and scale in this order from the left."""
+    """The transform of a node: its matrix, or translation @ rotation @ scale."""
     matrix = np.eye(4)
     if "matrix" in node:
         matrix = np.array(node["matrix"], dtype=np.float64).reshape((4, 4)).T

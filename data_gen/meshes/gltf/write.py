@@ -1,8 +1,8 @@
-"""Writes GLB files that say what is drawn: with trimesh, and what it leaves out or glTF understands otherwise.
+"""Writes GLB files that match what is drawn, with trimesh and corrections of its output.
 
-trimesh writes vertex colours as sRGB bytes, which glTF takes for linear, the mean of the face colours around a vertex,
-base colours in 8 bits, and no second coordinates, wraps, or unlit materials; sides and metalness are glTF's defaults
-where a material does not state them.
+trimesh writes vertex colours as sRGB bytes, which are linear in glTF, face colours as means around each vertex, base
+colours in 8 bits, and no second coordinates, wrap modes or unlit materials; sidedness and metalness get glTF's defaults
+if a material does not state them.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from data_gen.meshes.materials import (
 
 __all__ = ["write_glb"]
 
-_GENERATOR = "HyperPlanes"  # the reader takes the colours in files by trimesh for sRGB
+_GENERATOR = "HyperPlanes"  # the reader assumes sRGB colours in files by trimesh
 
 
 def write_glb(scene: trimesh.Scene) -> bytes:
-    """The content of a GLB file of a `Mesh.scene`, in its coordinates.
+    """A `Mesh.scene` as a GLB file, in its coordinates.
 
     Args:
-        scene: geometries whose visuals are canonical, without transforms.
+        scene: geometries with canonical visuals and without transforms.
     """
     written = trimesh.Scene()
     for name, mesh in scene.geometry.items():
@@ -64,7 +64,7 @@ def write_glb(scene: trimesh.Scene) -> bytes:
 
 
 def _with_attributes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A mesh with a material, whose other attributes trimesh writes under their names behind an underscore."""
+    """A mesh with a material; trimesh writes its other attributes with an underscore before their names."""
     visual, texture = visual_of(mesh), texture_of(mesh)
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     normals = np.asarray(mesh.vertex_normals) if mesh.metadata.get("smooth") else None
@@ -90,7 +90,7 @@ def _with_attributes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _material(stated: dict[str, Any], material: PBRMaterial, second: bool, tree: dict[str, Any]) -> dict[str, Any]:
-    """What trimesh states of a material, and the rest."""
+    """A material as written by trimesh, completed."""
     drawn = material if isinstance(material, DrawnMaterial) else DrawnMaterial()
     factors = {**stated.get("pbrMetallicRoughness", {}), "metallicFactor": float(material.metallicFactor or 0.0)}
     result = {**stated, "pbrMetallicRoughness": factors}
@@ -122,7 +122,7 @@ def _wrapped(reference: dict[str, Any], wrap: tuple[Wrap, Wrap], tree: dict[str,
 
 
 def _index(items: list[dict[str, Any]], item: dict[str, Any]) -> int:
-    """Where an item is in a list, at the end if it was not there."""
+    """The index of an item in a list, appended if absent."""
     if item not in items:
         items.append(item)
     return items.index(item)

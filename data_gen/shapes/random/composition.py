@@ -1,6 +1,6 @@
-"""Compositions of random primitives: objects that mean nothing, to learn from that views are to be trusted.
+"""Compositions of random primitives: meaningless objects, from which a network learns to rely on the views.
 
-How many primitives, and how long their axes are, follows LRM-Zero (Xie et al. 2024, arXiv 2406.09371).
+The number of primitives and the lengths of their axes follow LRM-Zero (Xie et al. 2024, arXiv 2406.09371).
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from data_gen.shapes.solids import Solid, rotation
 __all__ = ["COUNTS", "composition", "random_rotation"]
 
 COUNTS = (5, 5, 5, 4, 4, 3, 2, 1, 1)
-"""How often an object has 1, 2, ... 9 primitives."""
+"""Relative frequencies of objects with 1, 2, ... 9 primitives."""
 
 RELIEF = 0.5
 """Share of the primitives with a height field."""
 
 CUTS = 0.25
-"""Share of the primitives from which others are taken away, and of the solids of a structure a quarter as many."""
+"""Share of the primitives from which others are subtracted; a quarter of it for the solids of structures."""
 
 STRUCTURES = 0.3
 """Share of the objects with the structure of a table, a cart, a figure and so on."""
 
 APART = 0.003
-"""Copies are so much out of line, in extents of the solid: faces of two in one plane would flicker where they meet."""
+"""Offset between copies, in extents of the solid: coplanar faces of two copies would flicker where they overlap."""
 
 MOST_FACES = 3000
 """Faces of a primitive and its copies together."""
@@ -54,7 +54,7 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
 
 
 def _half_axes(rng: np.random.Generator, thin: bool) -> np.ndarray:
-    """Half extents (3,) of a primitive: axes of 0.25 to 2, some of them plates or rods where it may be thin."""
+    """Half extents (3,) of a primitive: axes of 0.25 to 2; some are plates or rods if it may be thin."""
     axes = rng.uniform(0.25, 2.0, 3)
     kind = pick(rng, _PROPORTIONS) if thin else "any"
     if kind == "cube":
@@ -89,7 +89,7 @@ def _piece(rng: np.random.Generator, thin: bool) -> Solid:
 
 
 def _cut(rng: np.random.Generator, solid: Solid) -> Solid:
-    """The solid without one to three primitives; where they leave less than a quarter of it, as it was."""
+    """The solid minus one to three primitives; unchanged if less than a quarter would be left."""
     left = solid
     low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     for _ in range(int(rng.integers(1, 4))):
@@ -155,7 +155,7 @@ def _base(rng: np.random.Generator, solids: list[Solid]) -> Solid:
 
 
 def _composed(rng: np.random.Generator) -> list[Solid]:
-    """One to nine primitives and what is repeated of them."""
+    """One to nine primitives, some of them repeated."""
     count = 1 + int(rng.choice(len(COUNTS), p=np.array(COUNTS) / sum(COUNTS)))
     solids: list[Solid] = []
     for _ in range(count):

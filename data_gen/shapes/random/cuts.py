@@ -1,4 +1,4 @@
-"""Boolean differences, by the library Manifold: what is left of a solid keeps its texture, the cut gets another.
+"""Boolean differences by the library Manifold: the rest of a solid keeps its texture, the cut gets another.
 
 A third of LRM-Zero's gain over plain primitives comes from cuts and wire frames.
 """
@@ -18,9 +18,9 @@ CUT = -2
 
 
 def _manifold(solid: Solid) -> tuple[manifold3d.Manifold, int]:
-    """The solid with texture coordinates as properties, and the number by which its faces are known after a cut.
+    """The solid with texture coordinates as properties, and the ID that identifies its faces after a cut.
 
-    Every face has its own corners, which are joined by their vertex.
+    Every face has its own corners, which are merged by vertex.
     """
     number = manifold3d.Manifold.reserve_ids(1)
     corners = solid.faces.reshape(-1)
@@ -41,11 +41,11 @@ def difference(solid: Solid, tool: Solid) -> Solid | None:
     """The part of a solid that lies outside another one.
 
     Returns:
-        The solid, in whose `cells` the first is `CUT` on faces that came from the tool; None where Manifold refuses
-        one of the two, or nothing is left.
+        The solid, with `CUT` as the first of `cells` on faces from the tool; None if Manifold refuses one of the two,
+        or nothing is left.
     """
     (whole, number), (taken, _) = _manifold(solid), _manifold(tool)
-    result = whole - taken  # refused where either of the two is
+    result = whole - taken  # invalid if either of the two is
     if result.status() != manifold3d.Error.NoError or result.is_empty():
         return None
     mesh = result.to_mesh64()

@@ -26,7 +26,7 @@ def filling(
         makers: the primitives.
         low: the corner (x, y, z) of smallest coordinates.
         high: the opposite corner.
-        relief: how likely it has a height field.
+        relief: probability of a height field.
 
     Returns:
         The solid.
@@ -38,7 +38,7 @@ def filling(
 
 
 def one_of(rng: np.random.Generator, makers: tuple[Maker, ...], relief: float) -> Solid:
-    """One of some primitives, with a height field by that chance."""
+    """One of some primitives, with a height field with probability `relief`."""
     return primitive(rng, relief, {maker: PRIMITIVES.get(maker, 1.0) for maker in makers})
 
 

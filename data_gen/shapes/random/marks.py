@@ -1,4 +1,4 @@
-"""Marks that look like writing, numbers, labels and signs, and mean nothing."""
+"""Meaningless marks that look like writing, numbers, labels and signs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _two_colours(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def glyph(rng: np.random.Generator) -> np.ndarray:
-    """A letter of no alphabet: which pixels (7, 5) two to four strokes between points of a lattice touch."""
+    """A made-up letter: the pixels (7, 5) touched by two to four strokes between points of a lattice."""
     cells = np.zeros((7, 5), dtype=bool)
     rows, columns = (0, 3, 6), (0, 2, 4)
     row, column = int(rng.choice(rows)), int(rng.choice(columns))

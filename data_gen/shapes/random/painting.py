@@ -15,11 +15,11 @@ from data_gen.shapes.solids import Solid
 __all__ = ["Paint"]
 
 _FINISHES = (Finish(1.0), Finish(0.8), Finish(0.55), Finish(0.4), Finish(0.35), Finish(0.4, 0.3))
-"""Matt to glossy; the last is metal, as far as the renderers draw it."""
+"""Matt to glossy; the last is metal, as far as the renderers support it."""
 
 
 class Paint:
-    """Draws the materials of one object: one for all of it, a few that come again, or new ones all the time.
+    """Draws the materials of one object: a single one, a few that recur, or always new ones.
 
     Attributes:
         finishes: the one or two finishes of the object.

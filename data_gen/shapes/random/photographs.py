@@ -1,8 +1,8 @@
-"""Pieces of photographs as textures: those that come with scikit-image and are free of rights.
+"""Crops of photographs as textures: those in scikit-image that are free of rights.
 
-By scikit-image's documentation (`skimage.data`), which names the source of each: brick, grass, gravel, camera,
-chelsea, coffee and cell are CC0, rocket and clock were released into the public domain. They are read from the
-installed package.
+According to scikit-image's documentation (`skimage.data`), which names all sources, brick, grass, gravel, camera,
+chelsea, coffee and cell are CC0, and rocket and clock are in the public domain. They are read from the installed
+package.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Random solids in the cube of side 2 about the origin: what compositions are made of.
+"""Random solids in the cube of side 2 about the origin, for compositions.
 
 Each function takes a generator, and whether the solid is to be fine enough to be displaced. LRM-Zero (Xie et al. 2024,
 arXiv 2406.09371) composes cubes, balls, cylinders, cones and tori; lathes, lofts, sweeps and frames of bars are added.
@@ -220,11 +220,11 @@ PRIMITIVES: dict[Maker, float] = {
     grille: 0.4,
     spring: 0.25,
 }
-"""How often each is drawn."""
+"""Relative frequencies."""
 
 
 FRAMES = (wire_box, wire_cage, grille, spring)
-"""Those that are made of bars, too thin to be displaced."""
+"""Primitives made of bars, too thin for displacement."""
 
 
 def primitive(rng: np.random.Generator, relief: float, shares: Mapping[Maker, float] = PRIMITIVES) -> Solid:
@@ -232,8 +232,8 @@ def primitive(rng: np.random.Generator, relief: float, shares: Mapping[Maker, fl
 
     Args:
         rng: source of every choice.
-        relief: how likely it has a height field.
-        shares: the primitives, and how often each is drawn.
+        relief: probability of a height field.
+        shares: the primitives, with relative frequencies.
 
     Returns:
         The solid.

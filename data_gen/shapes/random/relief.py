@@ -46,7 +46,7 @@ def random_relief(rng: np.random.Generator, solid: Solid) -> Solid:
 
     Args:
         rng: source of every choice.
-        solid: what is displaced, by at most a tenth of its smallest extent.
+        solid: the solid, displaced by at most a tenth of its smallest extent.
 
     Returns:
         The solid.
@@ -54,7 +54,7 @@ def random_relief(rng: np.random.Generator, solid: Solid) -> Solid:
     extents = np.ptp(solid.vertices, axis=0)
     amplitude = rng.uniform(0.03, 0.1) * extents.min()
     kind = pick(rng, _KINDS)
-    # wave vectors of up to three waves across the solid: its vertices could not carry more
+    # wave vectors of up to three waves across the solid: its vertices cannot represent more
     count = {"waves": 2, "furrows": 1}.get(kind, 8)
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

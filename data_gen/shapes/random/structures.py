@@ -1,7 +1,7 @@
-"""Rough structures of man-made and living things: what carries what, what is repeated, and what is symmetric.
+"""Rough structures of man-made and living things: support, repetition and symmetry of parts.
 
-Tables, carts, figures, houses, tools, plants, machines and shelves, whose parts are random solids. Nothing else of such
-an object is as a real one has it, so they are no class to be recognised.
+Tables, carts, figures, houses, tools, plants, machines and shelves, whose parts are random solids. Apart from their
+structure they do not resemble real objects, so they are not classes to recognise.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ TEXTURES: dict[Callable[[np.random.Generator], Material], float] = {
     label: 0.6,
     sign: 0.4,
 }
-"""How often each is drawn."""
+"""Relative frequencies."""
 
 
 def random_material(rng: np.random.Generator) -> Material:
