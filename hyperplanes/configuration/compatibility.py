@@ -36,7 +36,7 @@ def check_model(config: ModelConfig) -> type[Target]:
             f"learned_steps: expected 0 without a hypernetwork of kind 'volume', got {config.learned_steps}"
         )
     if config.plane_dropout and (target.permutation_invariant or not target.reads_planes):
-        raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
+        raise ValueError(f"plane_dropout: expected a field with a fixed number of planes, got {config.target}")
     for name in ("stacked", "hull_share", "gated", "average", "symmetric", "symmetry", "azimuth"):
         if getattr(config, name) and not target.permutation_invariant:
             raise ValueError(f"{name}: expected a field that takes any number of views, got {config.target}")
@@ -49,8 +49,8 @@ def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
     if isinstance(hypernetwork, VolumeHyperNetworkConfig):
         if target.volume_size is None:
             raise ValueError(
-                f"hypernetwork.kind: expected one that reads images for {config.target}, which knows views by their "
-                "places, got 'volume'"
+                f"hypernetwork.kind: expected one that reads images for {config.target}, which takes a fixed number "
+                "of views, got 'volume'"
             )
         if not getattr(config.network, "grid", 0):
             raise ValueError("network.grid: expected features of a grid for hypernetwork.kind 'volume' to write, got 0")
@@ -102,7 +102,7 @@ def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: Mo
         )
     if settings.average and (fresh := settings.fresh_share(views)) and config.hypernetwork is not None:
         raise ValueError(
-            f"average: expected 0 with first weights that are partly random (fresh {fresh:g}), got {settings.average:g}"
+            f"average: expected 0 with partly random initial weights (fresh {fresh:g}), got {settings.average:g}"
         )
 
 
@@ -121,7 +121,7 @@ def check_training(config: TrainingConfig, model: ModelConfig) -> None:
         )
     if model.method == "sv_meta" and find_targets()[model.target].permutation_invariant:
         raise ValueError(
-            f"sv_meta: expected a field that knows views by their places, got {model.target}, which would learn to "
+            f"sv_meta: expected a field with a fixed number of views, got {model.target}, which would learn to "
             "copy the colours of a single view"
         )
     for name in ("random_background", "empty_points", "antialias"):
@@ -132,7 +132,7 @@ def check_training(config: TrainingConfig, model: ModelConfig) -> None:
             )
     if model.plane_dropout and model.initialisation is not None:
         raise ValueError(
-            f"model.plane_dropout: expected 0 for {model.method}, which hides no plane, got {model.plane_dropout}"
+            f"model.plane_dropout: expected 0 for {model.method}, which masks no plane, got {model.plane_dropout}"
         )
     if config.rotations and not config.views:
         raise ValueError(f"training.rotations: expected 0 without training.views, got {config.rotations}")

@@ -53,7 +53,7 @@ class ModelConfig:
         gated: whether a gating network turns that share into one for each pixel (`adaptation.gating`);
             `training.gating` trains it after the model. With ten given views or more it also adds the hull to pictures
             after gradient steps.
-        average: share, in pictures, of the field before gradient steps, for the model that these made of one object
+        average: share, in pictures, of the field before gradient steps, in a model that these made for one object
             (`stacking.average`).
         learned_steps: steps of gradient descent by a network after the forward pass (`adaptation.learned_steps`), half
             as many from twenty views on; `training.learned_step` trains it after the model.
@@ -95,7 +95,7 @@ class ModelConfig:
         if self.azimuth is not None and not math.isfinite(self.azimuth):
             raise ValueError(f"azimuth: expected a finite angle in radians, got {self.azimuth}")
         if self.stacked and self.hull_share:
-            raise ValueError(f"hull_share: expected 0 where views decide it (stacked), got {self.hull_share}")
+            raise ValueError(f"hull_share: expected 0 for a stacked model, which finds it, got {self.hull_share}")
         chosen = [name for name in ("hypernetwork", "autoencoder", "initialisation") if getattr(self, name) is not None]
         if len(chosen) > 1:
             raise ValueError(f"model: expected at most one way to find weights, got {' and '.join(chosen)}")
@@ -146,7 +146,7 @@ class ModelConfig:
             return cls.structured(value)
         except SettingsError as error:
             raise CheckpointError(
-                f"{where}: expected the entries of this version's models, found a misfit ({error}); "
+                f"{where}: expected the entries of this version's models, found others ({error}); "
                 "copy the file again, or train again with this version"
             ) from None
 
