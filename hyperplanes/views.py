@@ -179,7 +179,7 @@ class Views:
         Args:
             count: how many, drawn with replacement.
             generator: on the CPU, so that every device draws the same.
-            among: flat indices (view, row, column) of the pixels to draw from; all where absent.
+            among: flat indices (view, row, column) of the pixels to draw from; by default all.
             near_far: as in `geometry.cast`.
 
         Returns:

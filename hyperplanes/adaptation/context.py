@@ -38,7 +38,7 @@ class SupportContext:
         planes: the views in the form in which the field looks colours up; None for a field that reads no image.
         occupancy: the visual hull of all support masks.
         hyperplanes: indices of the views that the hypernetwork reads.
-        volume: the planes resampled on a grid over the scene, for a hypernetwork that reads it.
+        volume: the planes projected onto a grid over the scene, for a hypernetwork that reads it.
         symmetry: of the object; the views are then followed by their reflections (`reflections.images_by`). None if all
             views were given.
     """

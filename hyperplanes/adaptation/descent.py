@@ -284,7 +284,7 @@ def split_holdout(support: Views, settings: FineTuning) -> tuple[Views, Views]:
         ValueError: fewer than 3 views.
     """
     if len(support) < 3:
-        raise ValueError(f"steps: expected at least 3 support views to choose their number by, got {len(support)}")
+        raise ValueError(f"steps: expected at least 3 support views for 'auto', got {len(support)}")
     every = min(settings.holdout, len(support))
     held_out = torch.arange(len(support)) % every == every // 2
     return support[(~held_out).nonzero()[:, 0]], support[held_out.nonzero()[:, 0]]

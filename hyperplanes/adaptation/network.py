@@ -128,7 +128,7 @@ class HyperPlanesNetwork(nn.Module):
             ValueError: a symmetry for a field that does not take any number of views.
         """
         if symmetry is not None and not self.target.permutation_invariant:
-            raise ValueError(f"symmetry: expected None for {self.config.target}, which knows views by their places")
+            raise ValueError(f"symmetry: expected None for {self.config.target}, which takes a fixed number of views")
         return prepare_context(
             self.to_own(support),
             self.target,

@@ -1,1 +1,1 @@
-"""Settings: named presets, and files of settings."""
+"""Settings of models and of training, named presets, and settings files."""

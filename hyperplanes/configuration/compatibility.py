@@ -1,4 +1,4 @@
-"""What goes with what: every rule that holds between settings of different parts of a model."""
+"""Compatibility rules between settings of different parts of a model."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from hyperplanes.utilities.errors import did_you_mean
 __all__ = ["VOLUME_CHANNELS", "check_fine_tuning", "check_model", "check_training"]
 
 VOLUME_CHANNELS = 4
-"""Channels of a volume that the volume loss compares: the share that is occupied, and the mean colour."""
+"""Channels of a volume that the volume loss compares: occupied share, and mean colour."""
 
 
 def check_model(config: ModelConfig) -> type[Target]:
-    """The target network of a model whose parts go together.
+    """The target network of a model with compatible parts.
 
     Raises:
-        ValueError: an unknown field, or parts that do not go together; the message names the setting to change.
+        ValueError: an unknown field, or incompatible parts; the message names the setting to change.
     """
     known = find_targets()
     if config.target not in known:
@@ -36,7 +36,7 @@ def check_model(config: ModelConfig) -> type[Target]:
             f"learned_steps: expected 0 without a hypernetwork of kind 'volume', got {config.learned_steps}"
         )
     if config.plane_dropout and (target.permutation_invariant or not target.reads_planes):
-        raise ValueError(f"plane_dropout: expected a field that knows planes by their places, got {config.target}")
+        raise ValueError(f"plane_dropout: expected a field with a fixed number of planes, got {config.target}")
     for name in ("stacked", "hull_share", "gated", "average", "symmetric", "symmetry", "azimuth"):
         if getattr(config, name) and not target.permutation_invariant:
             raise ValueError(f"{name}: expected a field that takes any number of views, got {config.target}")
@@ -44,13 +44,13 @@ def check_model(config: ModelConfig) -> type[Target]:
 
 
 def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
-    """What a hypernetwork reads has to be something that the field has, in a number that both can take."""
+    """The field must provide what a hypernetwork reads, in a number that both support."""
     hypernetwork = config.hypernetwork
     if isinstance(hypernetwork, VolumeHyperNetworkConfig):
         if target.volume_size is None:
             raise ValueError(
-                f"hypernetwork.kind: expected one that reads images for {config.target}, which knows views by their "
-                "places, got 'volume'"
+                f"hypernetwork.kind: expected one that reads images for {config.target}, which takes a fixed number "
+                "of views, got 'volume'"
             )
         if not getattr(config.network, "grid", 0):
             raise ValueError("network.grid: expected features of a grid for hypernetwork.kind 'volume' to write, got 0")
@@ -74,18 +74,18 @@ def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
 
 
 def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: ModelConfig, target: Target) -> None:
-    """Refuse a fine-tuning that the model cannot take.
+    """Refuse fine-tuning that is impossible for the model.
 
     Args:
         settings: of fine-tuning.
-        steps: that are asked for.
-        views: how many support views there are.
+        steps: number of steps, or "auto".
+        views: number of support views, without reflections.
         config: of the model.
         target: its network.
 
     Raises:
-        ValueError: the hypernetwork of a model that has none, a negative number of steps, steps on a single view by a
-            field that would learn to copy it, or pictures averaged with those of partly random weights.
+        ValueError: training the hypernetwork of a model without one, a negative number of steps, steps on a single view
+            for a field that would learn to copy it, or averaging with pictures of partly random weights.
     """
     if settings.trainable == "hypernetwork" and config.hypernetwork is None and config.autoencoder is None:
         raise ValueError("fine_tune: expected a model with a hypernetwork, got one without")
@@ -102,17 +102,17 @@ def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: Mo
         )
     if settings.average and (fresh := settings.fresh_share(views)) and config.hypernetwork is not None:
         raise ValueError(
-            f"average: expected 0 with first weights that are partly random (fresh {fresh:g}), got {settings.average:g}"
+            f"average: expected 0 with partly random initial weights (fresh {fresh:g}), got {settings.average:g}"
         )
 
 
 def check_training(config: TrainingConfig, model: ModelConfig) -> None:
-    """Refuse a training that a model cannot have.
+    """Refuse training that is impossible for the model.
 
     Raises:
-        ValueError: numbers of views for a field that knows them by their places, a single view an object for one that
-            does not, what a learned initialisation does not do, rotations without numbers of views, or the volume loss
-            for a model without a volume or a grid.
+        ValueError: numbers of views for a field with a fixed number, a single view per object for a field that takes
+            any number, settings that a learned initialisation does not use, rotations without numbers of views, or the
+            volume loss for a model without a volume or a grid.
     """
     if config.views and (not find_targets()[model.target].permutation_invariant or min(config.views) < 1):
         raise ValueError(
@@ -121,7 +121,7 @@ def check_training(config: TrainingConfig, model: ModelConfig) -> None:
         )
     if model.method == "sv_meta" and find_targets()[model.target].permutation_invariant:
         raise ValueError(
-            f"sv_meta: expected a field that knows views by their places, got {model.target}, which would learn to "
+            f"sv_meta: expected a field with a fixed number of views, got {model.target}, which would learn to "
             "copy the colours of a single view"
         )
     for name in ("random_background", "empty_points", "antialias"):
@@ -132,7 +132,7 @@ def check_training(config: TrainingConfig, model: ModelConfig) -> None:
             )
     if model.plane_dropout and model.initialisation is not None:
         raise ValueError(
-            f"model.plane_dropout: expected 0 for {model.method}, which hides no plane, got {model.plane_dropout}"
+            f"model.plane_dropout: expected 0 for {model.method}, which masks no plane, got {model.plane_dropout}"
         )
     if config.rotations and not config.views:
         raise ValueError(f"training.rotations: expected 0 without training.views, got {config.rotations}")

@@ -17,24 +17,24 @@ RATES: dict[str, tuple[Literal["adam", "muon"], float, float]] = {
     "weights": ("muon", 2e-3, 0.04),
     "hypernetwork": ("adam", 3e-4, 0.0),
 }
-"""What is optimised: by which optimiser, the learning rate of Adam, that of Muon. Chosen by measurement, see
+"""Default optimiser and learning rates of Adam and of Muon, for each value of `trainable`; measured in
 docs/adaptation.md."""
 
 
 FRESH = 0.5
-"""Share of random weights that fine-tuning a field with a grid of features begins with; docs/small-training.md."""
+"""Share of random weights in the initial ones, for a field with a grid of features; docs/small-training.md."""
 
 AVERAGE = 1.5
-"""Over the number of support views, of which there are few: the share of the field before the steps in pictures after
+"""Divided by the number of support views, if these are few: the share of the field before the steps in pictures after
 them; docs/adaptation.md."""
 
 CELLS, FINE_VIEWS = 64, 20
-"""Cells an axis of the grid of features that fine-tuning optimises with so many support views or more; hypernetworks
-write half as many (docs/adaptation.md). Of so many views half as many learned steps are taken (docs/image-based.md)."""
+"""Cells an axis of the grid of features in fine-tuning with FINE_VIEWS support views or more; hypernetworks write half
+as many (docs/adaptation.md). With FINE_VIEWS or more, half as many learned steps are taken (docs/image-based.md)."""
 
 MANY_VIEWS = 10
-"""Support views of a field of any number of them from which on fine-tuning begins with weights that are partly random,
-draws rays by contrast, and shows means with the visual hull; with fewer each of the three costs as often as it brings
+"""Support views from which on fine-tuning a field of any number of views begins with partly random weights, draws rays
+by contrast, and averages pictures with the visual hull; with fewer, each of the three loses as often as it gains
 (docs/small-training.md, docs/adaptation.md, docs/image-based.md). From this many views on, pictures are corrected too
 (`adaptation.residuals`)."""
 
@@ -47,34 +47,35 @@ class FineTuning:
     Attributes:
         trainable: what is optimised: "weights", theta + delta itself, or "hypernetwork", a copy of the hypernetwork
             while theta is frozen, as in the paper.
-        rays: a step, drawn from all support views.
-        optimiser: "muon", "adam" or "sgd"; the best for what is trainable, see RATES, where None.
-        learning_rate: of Adam or of plain gradient descent at the first step; that of RATES where None, or of
-            the field (`Target.fine_tuning_rates`).
-        muon_learning_rate: of Muon at the first step; likewise.
-        final_rate_factor: what the rates fall to, as a fraction; 1 keeps them.
-        decay: along half a "cosine", or "exponential".
+        rays: per step, drawn from all support views.
+        optimiser: "muon", "adam" or "sgd"; with None, that of RATES.
+        learning_rate: of Adam or plain gradient descent at the first step; with None, that of RATES, or of the field
+            (`Target.fine_tuning_rates`).
+        muon_learning_rate: the same for Muon.
+        final_rate_factor: the rates fall to this fraction; 1 keeps them.
+        decay: "cosine" (half a period) or "exponential".
         betas: of Adam.
         max_steps: the most steps that "auto" may choose.
-        holdout: every so many-th support view is held out of the planes and of the rays while "auto" chooses.
-        mask_views: a field that takes any number of views is not shown those that the rays of a step come from, a share
-            `1 / holdout` of them, as it could copy their colours; a single view cannot be masked.
-        fresh: share of random weights in those that the steps begin with, where a hypernetwork writes a grid of
-            features: trained weights interpolated with random ones learn more in the same steps (Ash & Adams 2020, "On
-            warm-starting neural network training"). Where None, FRESH with MANY_VIEWS or more, else none.
+        holdout: one in this many support views is held out while "auto" chooses.
+        mask_views: whether a field that takes any number of views does not see those that the rays of a step come from,
+            a share `1 / holdout` of them, since it could copy their colours; a single view cannot be masked.
+        fresh: share of random weights in the initial ones, if a hypernetwork writes a grid of features: trained weights
+            interpolated with random ones learn more in the same steps (Ash & Adams 2020, "On warm-starting neural
+            network training"). With None, FRESH for MANY_VIEWS or more, otherwise 0.
         seed: of rays and samples, and of random weights.
-        cells: an axis of the grid of features that the steps optimise, where the weights of a field with one are
-            trained: those that they begin with are interpolated to so many. Fewer than it has change nothing. Where
-            None, CELLS for a field that takes any number of views, with FINE_VIEWS or more of them, else 0.
-        average: share, in pictures, of the field that the steps begin with, where a hypernetwork writes a grid of
-            features, the weights are trained, and none of the first ones is random. Where None, AVERAGE over the
-            number of views, at most a half, with fewer than MANY_VIEWS, else 0.
-        draw: the pixels of rays: all with the same probability ("uniform"), or those more often around which colours
-            differ ("contrast"), which count less in the loss by as much. Where None, "contrast" for the weights of a
-            field that takes any number of views, with MANY_VIEWS or more of them, else "uniform", as in the paper.
+        cells: an axis of the grid of features, if the weights of a field with one are trained: the initial grid is
+            interpolated to this size. Smaller numbers than it has change nothing. With None, CELLS for a field that
+            takes any number of views and FINE_VIEWS or more of them, otherwise 0.
+        average: share, in pictures, of the field before the steps, if a hypernetwork writes a grid of features, the
+            weights are trained, and the initial ones are not random in part. With None, AVERAGE over the number of
+            views, at most a half, for fewer than MANY_VIEWS, otherwise 0.
+        draw: how pixels of rays are drawn: with equal probability ("uniform"), or more often where colours differ
+            around them ("contrast"), with a weight in the loss that compensates for that. With None, "contrast" for the
+            weights of a field that takes any number of views and MANY_VIEWS or more of them, otherwise "uniform", as in
+            the paper.
 
     Raises:
-        ValueError: an unknown name, no ray, a rate that is negative or not finite, or every view held out.
+        ValueError: an unknown name, or a number out of range.
     """
 
     trainable: Literal["weights", "hypernetwork"] = "weights"
@@ -109,21 +110,21 @@ class FineTuning:
                 raise ValueError(f"{name}: expected a share from 0 to 1, got {share}")
 
     def fresh_share(self, views: int) -> float:
-        """How much of the first weights is random, with so many support views."""
+        """The share of random weights in the initial ones, for this number of support views."""
         return (FRESH if views >= MANY_VIEWS else 0.0) if self.fresh is None else self.fresh
 
     def average_share(self, views: int) -> float:
-        """The share, in pictures, of the field that the steps begin with, with so many support views."""
+        """The share, in pictures, of the field before the steps, for this number of support views."""
         if self.trainable != "weights" or self.fresh_share(views):
             return 0.0
         few = AVERAGE / max(3, views) if views < MANY_VIEWS else 0.0
         return few if self.average is None else self.average
 
     def for_views(self, views: int, any_number: bool) -> FineTuning:
-        """The settings with what so many views have where they leave `fresh`, `draw`, `cells` or `average` open.
+        """The settings with `fresh`, `draw`, `cells` and `average` resolved for a number of views.
 
         Args:
-            views: how many there are.
+            views: number of support views.
             any_number: whether the field takes any number of them.
         """
         many = any_number and views >= MANY_VIEWS and self.trainable == "weights"
@@ -134,11 +135,11 @@ class FineTuning:
         return replace(self, draw=draw, cells=cells, **shares)
 
     def with_rates(self, rates: Mapping[str, float]) -> FineTuning:
-        """The settings with these rates where they state none; `rates` are fields of the settings by name."""
+        """The settings with `rates`, by name of the attribute, where these are None."""
         return replace(self, **{name: rate for name, rate in rates.items() if getattr(self, name) is None})
 
     def schedule(self, step: int, steps: int) -> float:
-        """What the rates are multiplied with at a step, counted from 0."""
+        """The factor of the rates at a step, counted from 0."""
         if self.decay == "exponential":
             return self.final_rate_factor ** (step / max(1, steps))
         cosine = (1 + math.cos(math.pi * step / max(1, steps))) / 2

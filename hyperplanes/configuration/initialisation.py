@@ -1,4 +1,4 @@
-"""Learned initialisations: weights from which a few gradient steps on one object go far (Tancik et al. 2021)."""
+"""Learned initialisations: weights for few gradient steps on one object (Tancik et al. 2021)."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ LEARNED: dict[str, str] = {
 class InitialisationConfig:
     """How an initialisation is learned, and how a field is optimised from it.
 
-    The defaults are those of Tancik et al. 2021 for ShapeNet: plain gradient descent at a rate of 0.5, 32 steps on an
-    object in training, 2,000 steps of 64 rays on a new object. `TrainingConfig` has the rays of a step in training (128
-    there) and the rate of Adam on the initialisation (5e-5 there). MAML keeps the graph of all its inner steps, so it
+    The defaults are those of Tancik et al. 2021 for ShapeNet: plain gradient descent with a rate of 0.5, 32 steps on an
+    object in training, 2,000 steps of 64 rays on a new object. `TrainingConfig` has the rays of a training step (128
+    there) and the rate of Adam for the initialisation (5e-5 there). MAML keeps the graph of all inner steps, so it
     takes few of them; Finn et al. 2017 take 5.
 
     Attributes:
         method: one of LEARNED.
         inner_steps: gradient steps on each object in training.
         inner_rate: of plain gradient descent, in training and on a new object.
-        steps: gradient steps on a new object, where the name of the method does not say how many.
-        test_rays: a step on a new object.
+        steps: gradient steps on a new object, if the name of the method has no number.
+        test_rays: per step on a new object.
     """
 
     method: str = "mv_meta"

@@ -1,4 +1,4 @@
-"""What a model is made of, and how that is written to a file and read from one that nobody here made."""
+"""The configuration of a model, written to files, and read from files that need not be trusted."""
 
 from __future__ import annotations
 
@@ -29,42 +29,41 @@ choose_by_tag(HyperNetworkConfig | None, "kind", KINDS)
 @checked_fields
 @dataclass(frozen=True)
 class ModelConfig:
-    """What a model is made of; saved beside its weights.
+    """The configuration of a model; saved with its weights.
 
     Attributes:
         target: which field: a name of `fields.find_targets()`.
-        network: the shape of the target, of the dataclass that the field names (`Target.config_type`).
+        network: the shape of the target, in the dataclass of the field (`Target.config_type`).
         hypernetwork: the shape of the hypernetwork, which reads images or a volume; None for one set of weights for all
             objects.
-        autoencoder: the shape of an encoder whose code the target reads, in place of a hypernetwork.
-        initialisation: how the weights were learned as an initialisation, if they were.
-        coarse_network: whether a second network of the same shape proposes where to sample (NeRF's coarse network).
-        sampling: how fields are rendered by default, in training too.
-        hull_resolution: voxels an axis of the visual hull; at least, where a field of any number of views is shown
-            larger pictures, up to 192.
-        order: which support view a plane is: the one "matched" to its camera direction in training, or views in the
-            order of their "file", as the paper takes them.
-        plane_dropout: how likely a step of training hides a plane of an object, for a field that knows planes by their
-            places. It learns to do without any of them, and where there are fewer views than planes, each stands at one
-            plane and the others are hidden, not filled with views that stand elsewhere.
-        stacked: pictures of a field of any number of views are means with those of `hull_blend`, by a share that some
-            of five or more views decide, which are held out for the purpose (`adaptation.stacking`). Training does
-            without.
-        hull_share: of `hull_blend` in the pictures of a model that is not `stacked`: what was decided for one object.
-        gated: a gating network makes a share of every pixel of that one (`adaptation.gating`); `training.gating` trains
-            it after the model. With ten given views or more it also mixes the hull into pictures after gradient steps.
-        average: share of a field of other weights in the pictures of a model: of those before gradient steps, where the
-            model is what these made of one object (`stacking.average`).
-        learned_steps: steps of gradient descent that a network takes after the forward pass
-            (`adaptation.learned_steps`), half as many from twenty views on; `training.learned_step` trains it after the
-            model.
-        residuals: pictures from ten views or more, unless these are large, are corrected by what the field lacks in
-            them (`adaptation.residuals`).
-        symmetric: views of an object that looks symmetric are shown to the model together with their reflections
-            (`adaptation.symmetry`). Training does without.
-        symmetry: that of the object, where it is known: what was found for one.
-        azimuth: likewise, the rotation of the object to its canonical frame, in radians. Where it is not known, a
-            `symmetric` model looks for it (`adaptation.canonical_frame`).
+        autoencoder: the shape of an encoder whose code the target reads, instead of a hypernetwork.
+        initialisation: how the weights are learned as an initialisation, if they are.
+        coarse_network: whether a second network of the same shape proposes samples (NeRF's coarse network).
+        sampling: default sampler of fields, also in training.
+        hull_resolution: voxels an axis of the visual hull; a field of any number of views uses up to 192 for larger
+            images.
+        order: which support view becomes which plane: the one "matched" to its camera direction in training, or views
+            in the order of the "file", as in the paper.
+        plane_dropout: probability that a training step masks a plane of an object, for a field with a fixed number of
+            planes. With fewer views than planes, each view is then used for one plane and the other planes are masked,
+            instead of filled with views from elsewhere.
+        stacked: whether pictures of a field of any number of views are averaged with those of `hull_blend`. Of five or
+            more views, some are held out to decide the share (`adaptation.stacking`). Not used in training.
+        hull_share: of `hull_blend` in pictures of a model that is not `stacked`, as decided for one object.
+        gated: whether a gating network turns that share into one for each pixel (`adaptation.gating`);
+            `training.gating` trains it after the model. With ten given views or more it also adds the hull to pictures
+            after gradient steps.
+        average: share, in pictures, of the field before gradient steps, in a model that these made for one object
+            (`stacking.average`).
+        learned_steps: steps of gradient descent by a network after the forward pass (`adaptation.learned_steps`), half
+            as many from twenty views on; `training.learned_step` trains it after the model.
+        residuals: whether pictures from ten views or more, unless these are large, are corrected by the residuals of
+            the views (`adaptation.residuals`).
+        symmetric: whether reflections of the views of an object that looks symmetric are added to its views
+            (`adaptation.symmetry`). Not used in training.
+        symmetry: of the object, if it is known.
+        azimuth: rotation of the object to its canonical frame, in radians, if it is known. Otherwise a `symmetric`
+            model looks for it (`adaptation.canonical_frame`).
     """
 
     target: str = "point_multiplane"
@@ -96,14 +95,14 @@ class ModelConfig:
         if self.azimuth is not None and not math.isfinite(self.azimuth):
             raise ValueError(f"azimuth: expected a finite angle in radians, got {self.azimuth}")
         if self.stacked and self.hull_share:
-            raise ValueError(f"hull_share: expected 0 where views decide it (stacked), got {self.hull_share}")
+            raise ValueError(f"hull_share: expected 0 for a stacked model, which finds it, got {self.hull_share}")
         chosen = [name for name in ("hypernetwork", "autoencoder", "initialisation") if getattr(self, name) is not None]
         if len(chosen) > 1:
             raise ValueError(f"model: expected at most one way to find weights, got {' and '.join(chosen)}")
 
     @property
     def method(self) -> str:
-        """The name of the method that such a model is: "hyperplanes", "autoencoder", "mv_meta", "nerf" and so on."""
+        """The name of the method of such a model: "hyperplanes", "autoencoder", "mv_meta", "nerf" and so on."""
         if self.hypernetwork is not None:
             return "hyperplanes"
         if self.autoencoder is not None:
@@ -111,14 +110,14 @@ class ModelConfig:
         return self.target if self.initialisation is None else self.initialisation.method
 
     def with_target(self, name: str) -> ModelConfig:
-        """The same model of another field, in whose shape the settings that both have stay as they are."""
+        """The same model with another field; settings of the shape that both fields have are kept."""
         kind = find_targets()[name].config_type
         shared = {each.name for each in fields(kind)} & {each.name for each in fields(self.network)}
         network = kind(**{name: getattr(self.network, name) for name in shared})
         return replace(self, target=name, network=network)
 
     def target_alone(self) -> ModelConfig:
-        """The model without what finds weights for its target, and without another field in its pictures."""
+        """The model of its target alone, without a network that finds weights and without averaged pictures."""
         alone = replace(self, hypernetwork=None, autoencoder=None, initialisation=None)
         return replace(alone, stacked=False, hull_share=0.0, gated=False, average=0.0, learned_steps=0)
 
@@ -131,23 +130,23 @@ class ModelConfig:
 
     @classmethod
     def of_json(cls, value: Mapping[str, Any], where: Path | str = "configuration") -> ModelConfig:
-        """The configuration that `as_json` wrote. Entries that have defaults may be missing.
+        """The configuration that `as_json` wrote. Entries with defaults may be missing.
 
         Args:
-            value: what a file holds.
+            value: content of a file.
             where: the file, for the message.
 
         Returns:
-            A configuration whose numbers are of a size that can be allocated.
+            A configuration with all numbers in their ranges.
 
         Raises:
-            CheckpointError: an unknown or missing entry, one of another type, or an absurd number.
+            CheckpointError: an unknown or missing entry, or one of a wrong type or out of range.
         """
         try:
             return cls.structured(value)
         except SettingsError as error:
             raise CheckpointError(
-                f"{where}: expected the entries of this version's models, found a misfit ({error}); "
+                f"{where}: expected the entries of this version's models, found others ({error}); "
                 "copy the file again, or train again with this version"
             ) from None
 
@@ -162,7 +161,7 @@ class ModelConfig:
             entries["sampling"] = {**entries["sampling"], "protocol": value["protocol"]}
         made = structure(cls, entries)
 
-        # the field says which dataclass its shape is
+        # the field determines the dataclass of its shape
         known = find_targets()
         kind = known[made.target].config_type if made.target in known else TargetConfig
         return replace(made, network=structure(kind, value["network"], "network"))

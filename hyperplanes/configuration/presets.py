@@ -1,4 +1,4 @@
-"""Named configurations: what a model is made of and how it is trained."""
+"""Named configurations of models and their training."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PROTOCOLS: dict[str, Hierarchical | RayMarching | None] = {
     "paper": PAPER_SAMPLING,
     "ray_marching": RayMarching(),
 }
-"""How fields are sampled: as the preset or the checkpoint says, as the paper does, or packed where something is."""
+"""Samplers of fields: that of the preset or checkpoint, that of the paper, or packed samples in occupied voxels."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Preset:
     Attributes:
         model: the architecture.
         training: the procedure.
-        resolution: pixels a side of the images it is meant for.
+        resolution: pixels a side of the images that it is meant for.
         about: one line for the list of presets.
         initialisation: how initialisations are learned at this scale; its `method` is ignored.
-        outer_rate: of Adam on an initialisation.
+        outer_rate: learning rate of Adam for an initialisation.
         autoencoder: the shape of the autoencoder at this scale.
     """
 
@@ -50,10 +50,10 @@ class Preset:
     autoencoder: AutoencoderConfig = field(default_factory=AutoencoderConfig)
 
     def by_protocol(self, name: str) -> Preset:
-        """The same model sampled by another protocol.
+        """The same model with the sampler of another protocol.
 
         Args:
-            name: of PROTOCOLS; "ray_marching" leaves a preset that is sampled so already as it is.
+            name: of PROTOCOLS; "ray_marching" does not change a preset that already uses it.
 
         Returns:
             The preset.
@@ -73,14 +73,14 @@ class Preset:
 
         Args:
             method: of TRAINABLE, or a field of another installed package.
-            target: which field; that of the preset where not given, or for learned initialisations NeRF.
+            target: which field; by default that of the preset, or NeRF for learned initialisations.
 
         Returns:
-            The same scale for that method.
+            The preset of the same scale for that method.
 
         Raises:
-            ValueError: an unknown method or target, HyperPlanes of a configuration without a hypernetwork, or a target
-                beside a method that is another one.
+            ValueError: an unknown method or target, HyperPlanes with a configuration without a hypernetwork, or a
+                target that contradicts the method.
         """
         targets = find_targets()
         known = [*TRAINABLE, *(name for name in targets if name not in TRAINABLE)]
@@ -92,7 +92,7 @@ class Preset:
         chosen = self
         if method in targets:
             chosen, target = self.without_hypernetwork(), method
-        elif method == self.model.method:  # another field for it: its own settings stay
+        elif method == self.model.method:  # its settings are kept
             pass
         elif method == "autoencoder":
             chosen = self.with_autoencoder()
@@ -106,24 +106,24 @@ class Preset:
         return replace(chosen, model=chosen.model.with_target(target))
 
     def for_known_places(self) -> Preset:
-        """Without what only a field of any number of views can do: be trained by some of them, and be shown more."""
+        """The preset without settings that only a field of any number of views supports."""
         alone = {"stacked": False, "gated": False, "learned_steps": 0, "hull_share": 0.0, "symmetric": False}
         model = replace(self.model, **alone, residuals=False, symmetry=None, azimuth=None)
         return replace(self, model=model, training=replace(_of_all_views(self.training), volume_loss=0.0))
 
     def without_hypernetwork(self) -> Preset:
         """The same target trained as one set of weights for all objects (PointMultiPlaneNeRF)."""
-        training = replace(self.training, volume_loss=0.0)  # of what a hypernetwork reads
+        training = replace(self.training, volume_loss=0.0)  # needs a hypernetwork
         model = replace(self.model, hypernetwork=None, autoencoder=None, initialisation=None, learned_steps=0)
         return replace(self, model=model, training=training)
 
     def with_autoencoder(self) -> Preset:
-        """The same target with the code of an encoder as an input, in place of a hypernetwork."""
+        """The same target with the code of an encoder as an input, instead of a hypernetwork."""
         plain = self.without_hypernetwork()
         return replace(plain, model=replace(plain.model, autoencoder=self.autoencoder))
 
     def learning_initialisation(self, method: str) -> Preset:
-        """The same target as a learned initialisation: one object a step, Adam on the initialisation, no schedule.
+        """The same target as a learned initialisation: one object per step, Adam on the initialisation, no schedule.
 
         Args:
             method: one of LEARNED.
@@ -148,7 +148,7 @@ class Preset:
 
 
 def _of_all_views(training: TrainingConfig) -> TrainingConfig:
-    """The same on the objects as they are and all their support views, not on episodes of some."""
+    """The same training on all support views of unrotated objects, instead of on random subsets."""
     return replace(training, views=(), rotations=0.0)
 
 
@@ -156,17 +156,17 @@ MAML_STEPS = 4
 """Inner steps of MAML, which keeps the graph of all of them."""
 
 MATCHING_RATE = 1e-3
-"""Of Adam on random weights that are matched to an initialisation."""
+"""Learning rate of Adam on random weights that are matched to an initialisation."""
 
 
 ALL_LAYERS = ImageHyperNetworkConfig(
     normalisation="group", activation="silu", layers=("all",), update="low_rank", weights_seen="all"
 )
-"""What served best in docs/hypernetwork.md: a low-rank update of every layer, and no batch statistics."""
+"""The best choice of docs/hypernetwork.md: a low-rank update of every layer, and no batch statistics."""
 
 PAPER_TRAINING = TrainingConfig(steps=100_000, tasks=1, reference_objects=3, rays=512)
-"""One object and 512 rays a step, Adam at 1e-4 for theta and the hypernetwork (Appendix B); the HyperPlanes of three
-more objects are read for the standardisation."""
+"""One object and 512 rays per step, Adam at 1e-4 for theta and the hypernetwork (Appendix B); the HyperPlanes of three
+more objects are read for standardisation."""
 
 MUON_TRAINING = TrainingConfig(
     tasks=4,
@@ -176,7 +176,7 @@ MUON_TRAINING = TrainingConfig(
     hypernetwork_learning_rate=1e-3,
     final_rate_factor=0.02,
 )
-"""What trains fields of 128x128 in hours on a few cores."""
+"""Training of fields of 128x128 in hours on a few cores."""
 
 PRESETS: dict[str, Preset] = {
     "quick": Preset(
@@ -283,5 +283,5 @@ def preset(name: str) -> Preset:
 
 
 TRAINABLE = ("hyperplanes", *reversed(TARGETS), "autoencoder", *LEARNED)
-"""Methods that `train` knows, with the fields of other installed packages; those that are named as a field are one set
-of weights for all objects."""
+"""Methods that `train` takes, besides the fields of other installed packages; those named as a field have one set of
+weights for all objects."""

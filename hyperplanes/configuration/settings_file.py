@@ -1,6 +1,6 @@
-"""An experiment in a file: YAML of the dataclasses of a model and its training, whole or in part.
+"""Settings files: YAML of the dataclasses of a model and its training, complete or in part.
 
-preset: small               # where the entries that are not given come from
+preset: small               # for entries that are not given
 method: hyperplanes
 model: {hypernetwork: {views: 3}}
 training: {learning_rate: 1e-3}
@@ -62,10 +62,10 @@ def read_experiment(path: Path) -> dict[str, Any]:
         path: YAML, such as the config.yaml that `train` writes beside its weights.
 
     Returns:
-        Some of preset, method, model and training; what is in them is not looked at.
+        Some of preset, method, model and training, whose content is not checked.
 
     Raises:
-        DataError: no such file, no YAML, or other entries.
+        DataError: a missing file, invalid YAML, or other entries.
     """
     remedy = "`hyperplanes presets quick` prints a whole one"
     try:
@@ -89,12 +89,12 @@ def read_experiment(path: Path) -> dict[str, Any]:
 
 
 def write_experiment(path: Path, chosen: Preset) -> None:
-    """Write a file from which `read_experiment` and `changed` make the same model and training."""
+    """Write a file from which `read_experiment` and `changed` restore the same model and training."""
     write_whole(path, document(chosen).encode())
 
 
 def document(chosen: Preset) -> str:
-    """The YAML of a configuration, every entry of it."""
+    """The complete YAML of a configuration."""
     entries = {"method": chosen.model.method, "model": chosen.model.as_json(), "training": asdict(chosen.training)}
     return yaml.safe_dump(entries, sort_keys=False)
 
@@ -102,7 +102,7 @@ def document(chosen: Preset) -> str:
 def changed(chosen: Preset, changes: Mapping[str, Any]) -> Preset:
     """A configuration with some entries replaced.
 
-    Where the protocol changes, samples that are not given are those that it has by default.
+    If the protocol changes, settings of its sampler that are not given have their defaults.
 
     Args:
         chosen: the configuration.
@@ -112,7 +112,7 @@ def changed(chosen: Preset, changes: Mapping[str, Any]) -> Preset:
         The new configuration.
 
     Raises:
-        SettingsError: an unknown entry, or a value that does not fit; its path begins with "model" or "training".
+        SettingsError: an unknown entry or an invalid value; its path begins with "model" or "training".
     """
     model, training = chosen.model.as_json(), asdict(chosen.training)
     try:
@@ -130,7 +130,7 @@ def changed(chosen: Preset, changes: Mapping[str, Any]) -> Preset:
 
 
 def _change_kind(model: dict[str, Any], wanted: Any) -> None:
-    """Keep of the shape of a hypernetwork, and of a network, what that of the wanted kind or field has too."""
+    """Drops settings of the shape of network and hypernetwork that the wanted field and kind do not have."""
     if not isinstance(wanted, Mapping):
         return
     known = find_targets()
@@ -146,7 +146,7 @@ def _change_kind(model: dict[str, Any], wanted: Any) -> None:
 
 
 def _merged(base: Mapping[str, Any], changes: Any) -> Any:
-    """A mapping with some entries replaced, entry by entry where both are mappings."""
+    """A mapping with some entries replaced, recursively for nested mappings."""
     if not isinstance(changes, Mapping):
         return changes
     result = dict(base)
@@ -162,19 +162,19 @@ def _merged(base: Mapping[str, Any], changes: Any) -> Any:
 
 
 def parse_options(given: Sequence[str]) -> dict[str, Any]:
-    """The entries that options of the command line name.
+    """The entries of command-line options.
 
     >>> parse_options(["--model.hypernetwork.views", "3", "--training.learning-rate=1e-3"])
     {'model': {'hypernetwork': {'views': 3}}, 'training': {'learning_rate': 0.001}}
 
     Args:
-        given: options with a dot in their names, each followed by its value or values; without one it is switched on.
+        given: options with a dot in their names, each followed by its value or values; True without one.
 
     Returns:
         Entries for `changed`.
 
     Raises:
-        SettingsError: an option of neither the model nor the training, or a value that is no YAML.
+        SettingsError: an option of neither the model nor the training, or an invalid value.
     """
     result: dict[str, Any] = {}
     for option, values in _grouped(given):

@@ -14,54 +14,54 @@ __all__ = ["TrainingConfig"]
 @checked_fields
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How a model is trained (HyperPlanes, Appendix B: one task a step, 512 rays, learning rates 1e-4, no schedule).
+    """How a model is trained (HyperPlanes, Appendix B: one task per step, 512 rays, learning rates 1e-4, no schedule).
 
-    Four objects of 128 rays a step cost what one of 512 does and end 0.5 dB higher; the paper's presets say one.
+    Four objects with 128 rays per step take as long as one with 512 and end 0.5 dB higher; the paper's presets use one.
 
     Attributes:
         steps: Adam steps.
-        epochs: how often each training object is drawn, on average, instead of `steps`; 0 takes `steps`.
-        tasks: objects a step.
-        reference_objects: further objects a step, of which only the HyperPlanes are read. The hypernetwork standardises
-            codes by the objects of the step, and cannot tell what one object alone has in common with the others.
-        rays: query pixels an object and step.
-        antialias: each of these pixels is the mean of three rays; pictures have five at edges. What is trained by
-            one ray a pixel shows the mean over its area by a soft surface.
+        epochs: how often each training object is drawn, on average, instead of `steps`; 0 uses `steps`.
+        tasks: objects per step.
+        reference_objects: further objects per step, of which only the HyperPlanes are read. The hypernetwork
+            standardises codes over the objects of the step, and one object does not tell what all have in common.
+        rays: query pixels per object and step.
+        antialias: whether each of these pixels is the mean of three rays; pictures have five at edges. A field trained
+            on one ray per pixel learns a soft surface in place of the mean over its area.
         views: numbers of support views, for a field that takes any number of them. Each episode shows one of these
-            numbers of random views of its object, support and query alike, and draws rays from others. Empty: all
-            support views, in every step.
-        episodes: how many of those are at hand at a time for every four objects of a step. Each step begins one of
-            them and draws four, so that views, masks and hulls are made ready once for several steps.
+            numbers of random views of its object, both support and query views, and draws rays from the others. If
+            empty, each step shows all support views.
+        episodes: number of episodes that are kept for every four objects of a step. Each step adds one of them and
+            draws four, so that views, masks and hulls are prepared once for several steps.
         rotations: share of the episodes of `views` whose object is rotated about the vertical axis by a random angle. A
-            grid of features and what reads it know objects as they stand in the training; photographs come with any
-            heading.
-        random_background: prediction and truth are composited over a random colour for every object and step, as far
-            as masks say what is background: over white alone, a white surface cannot be told from none.
-        empty_points: points outside the hull, an object and step, at which the field is asked to be empty. Packed
-            training sees nothing there, but a field that is rendered without masks must know.
-        volume_loss: weight of a loss beside that of rays, for a hypernetwork that reads a volume: the first features of
-            the target's grid are to be the hull and the colours of all views of the object, so that every cell teaches
-            what is behind what few views show, and not only those that a ray meets; 0 is none.
+            grid of features, and a network that reads it, learn objects in the orientation of the training; photographs
+            have any orientation.
+        random_background: whether prediction and truth are composited over a random colour for each object and step,
+            where masks show background: over white alone, a white surface looks like none.
+        empty_points: points outside the hull, per object and step, at which the density is trained to be 0. Packed
+            training takes no samples there, but a field may be rendered without masks.
+        volume_loss: weight of an additional loss for a hypernetwork that reads a volume: the first features of the
+            target's grid are trained to be the hull and the colours of all views of the object, so that every cell,
+            not only those on rays, teaches what few views do not show; 0 for none.
         optimiser: of theta: "adam" as in the paper, or "muon" for the matrices of its hidden layers.
         learning_rate: of theta, by Adam.
         muon_learning_rate: of the matrices of theta that Muon optimises.
         hypernetwork_learning_rate: of the hypernetwork.
-        precision: of a hypernetwork's convolutions and matrix products: "single", or "bfloat16" beside weights and
-            updates of single precision (`torch.autocast`). "automatic" is bfloat16 for hypernetworks that read volumes
+        precision: of a hypernetwork's convolutions and matrix products: "single", or "bfloat16" with weights and
+            updates in single precision (`torch.autocast`). "automatic" is bfloat16 for hypernetworks that read volumes
             on CPUs with AMX and, on Linux, AMD's with AVX512_BF16, where a step of `small` takes three quarters of the
-            time, and single elsewhere. Those that read images standardise codes over the few objects of a step, and
-            rounding grows with that. A training that is resumed keeps the precision that it began with.
+            time, and single elsewhere. Those that read images standardise codes over the few objects of a step, which
+            amplifies rounding. A resumed training keeps its precision.
         warmup: steps in which the learning rates rise from zero.
-        final_rate_factor: what the learning rates fall to along half a cosine, as a fraction; 1 keeps them.
-        clip: the norm to which the gradient of all weights that a step moves is cut where it is longer; 0 leaves it.
-        balanced: classes are drawn equally often, however many objects each has. Where a data set does not state them,
-            each data set is one.
+        final_rate_factor: the learning rates fall to this fraction along half a cosine; 1 keeps them.
+        clip: largest norm of the gradient of all trained weights, to which it is clipped; 0 does not clip.
+        balanced: whether classes are drawn equally often, whatever their numbers of objects. If a data set states no
+            classes, it is one class.
         evaluate_every: steps between validations on held-out objects.
-        held_out: how many of them are taken: objects of the "val" split, or where there is none of "test".
+        held_out: number of these objects, from the "val" split, or "test" if there is none.
         checkpoint_every: steps between checkpoints.
-        keep_last: how many of them are kept; older ones are deleted.
-        memory: bytes of images, planes and hulls that are kept for later steps; the last object always is.
-        prefetch: steps whose objects a thread makes ready ahead, beyond `memory`; 0 makes them when they are due.
+        keep_last: number of checkpoints that are kept; older ones are deleted.
+        memory: bytes of images, planes and hulls that are kept for later steps; the last object is always kept.
+        prefetch: steps whose objects a thread prepares ahead, beyond `memory`; 0 prepares them when they are needed.
         seed: of the objects, rays and samples of every step.
     """
 
@@ -105,12 +105,12 @@ class TrainingConfig:
             raise ValueError(f"rotations: expected a share from 0 to 1, got {self.rotations}")
 
     def steps_for(self, objects: int) -> int:
-        """How many steps are taken with so many training objects.
+        """The number of steps for a number of training objects.
 
         >>> TrainingConfig(epochs=10, tasks=4).steps_for(150)
         375
 
         Args:
-            objects: to train on.
+            objects: number of training objects.
         """
         return -(-self.epochs * objects // self.tasks) if self.epochs else self.steps

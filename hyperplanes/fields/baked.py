@@ -29,8 +29,8 @@ STORED = {  # dtypes of the tensors in a file
 def spherical_harmonics(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
     """The real spherical harmonics up to degree 2 at unit directions, orthonormal over the sphere.
 
-    >>> float(spherical_harmonics(torch.tensor([0.0, 0.0, 1.0]))[0] ** 2 * 4 * torch.pi)  # doctest: +ELLIPSIS
-    1.0...
+    >>> round(float(spherical_harmonics(torch.tensor([0.0, 0.0, 1.0]))[0] ** 2 * 4 * torch.pi), 3)
+    1.0
     """
     x, y, z = directions.unbind(-1)
     return torch.stack(

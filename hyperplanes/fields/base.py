@@ -103,11 +103,11 @@ class Target(nn.Module):
     @property
     def input_size(self) -> int:
         """Number of inputs of the first layer."""
-        raise TypeError(f"{type(self).__name__} does not say what it reads")
+        raise TypeError(f"{type(self).__name__} does not define input_size")
 
     def inputs(self, points: Float[Tensor, "point 3"], planes: ImagePlanes | None, bounds: Sphere) -> Tensor:
         """The inputs of the first layer for world points, (point, input_size)."""
-        raise TypeError(f"{type(self).__name__} does not say what it reads")
+        raise TypeError(f"{type(self).__name__} does not define inputs")
 
     @property
     def rig_size(self) -> int:
@@ -145,7 +145,7 @@ class Target(nn.Module):
         return ImagePlanes(views.images, views.cameras)
 
     def volume_of(self, planes: Any) -> Float[Tensor, "channel x y z"] | None:
-        """The planes resampled on a grid over the scene, for a hypernetwork that reads it; by default None."""
+        """The planes projected onto a grid over the scene, for a hypernetwork that reads it; by default None."""
         return None
 
     def with_surface(self, planes: Any, voxels: Occupancy) -> Any:
@@ -243,11 +243,11 @@ class Field:
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
         """Colour in [0, 1] and density per world unit at points seen along unit directions."""
-        raise TypeError(f"{type(self).__name__} does not say what it computes")
+        raise TypeError(f"{type(self).__name__} does not define __call__")
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without colour."""
-        raise TypeError(f"{type(self).__name__} does not say what it computes")
+        raise TypeError(f"{type(self).__name__} does not define density")
 
     def trunk(self, inputs: Float[Tensor, "point input"]) -> Float[Tensor, "point width"]:
         """The layers before the heads, with the skip connection of NeRF in their middle."""

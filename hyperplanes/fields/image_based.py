@@ -144,7 +144,7 @@ class ImageBasedNeRF(Target):
         return VisibilityPlanes(views.images, views.cameras, views.masks, occupancy)
 
     def volume_of(self, planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
-        """The views resampled in the cells of the grid."""
+        """The views projected onto the cells of the grid."""
         return volume_of(planes)
 
     def with_surface(self, planes: VisibilityPlanes, voxels: Occupancy) -> VisibilityPlanes:

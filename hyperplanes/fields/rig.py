@@ -41,7 +41,7 @@ class Rig:
         positions = self.positions.float().cpu()
         if not positions.any():
             raise ValueError(
-                "rig: expected the camera directions of the training's views, got none; set_rig takes them from views"
+                "rig: expected the camera directions of the training views, got none; set_rig takes them from views"
             )
         return positions
 

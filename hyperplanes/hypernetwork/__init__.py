@@ -1,4 +1,4 @@
-"""From what is seen of an object to the update of a network's weights."""
+"""Hypernetworks: from images or a volume of an object to an update of the weights of a target network."""
 
 from hyperplanes.hypernetwork.autoencoder import Autoencoder, AutoencoderConfig
 from hyperplanes.hypernetwork.base import HyperNetwork, Observed

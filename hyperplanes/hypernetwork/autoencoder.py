@@ -1,4 +1,4 @@
-"""The autoencoder: k images become one code, and the code is an input of the field."""
+"""The autoencoder: k images are encoded as one code, which is an input of the field."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ __all__ = ["Autoencoder", "AutoencoderConfig"]
 @checked_fields
 @dataclass(frozen=True)
 class AutoencoderConfig:
-    """The shape of an encoder whose code the field reads (HyperPlanes, Table 5, names it and says no more about it).
+    """The shape of an encoder whose code the field reads (named, but not described, in HyperPlanes, Table 5).
 
     Attributes:
         views: number of images it reads.
-        choice: which of the planes they are: "farthest" apart, or the "first".
+        choice: which of the planes it reads: the "farthest" apart, or the "first".
         encoder: "convnet" or "resnet101".
         normalisation: of the encoder, as in `ImageHyperNetworkConfig`.
         code: length of the code of one image.
@@ -43,18 +43,17 @@ class AutoencoderConfig:
 
 
 class Autoencoder(HyperNetwork):
-    """E(I_1..I_k, d_1..d_k) = z, which every layer that reads a point reads beside it: F(x, z, d; theta).
+    """E(I_1..I_k, d_1..d_k) = z, which is concatenated with the inputs of the field: F(x, z, d; theta).
 
-    All objects share theta, and no update is added to it. A layer that reads [x, z] computes
-    W [x, z] + b = W_x x + (W_z z + b), so the code is handed to the field as what it adds to the bias of such a layer.
-    Where the images differ in nothing, so do the fields.
+    All objects share theta, without an update. A layer that reads [x, z] computes W [x, z] + b = W_x x + (W_z z + b),
+    so the field gets the code as an offset of the biases of such layers. Objects with equal images get equal fields.
     """
 
     def __init__(self, config: AutoencoderConfig, shapes: Mapping[str, torch.Size], inputs: tuple[str, ...]) -> None:
-        """An encoder and the weights by which the field reads its code.
+        """An encoder, and the weights with which the field reads its code.
 
         Args:
-            config: its shape.
+            config: of the encoder.
             shapes: of the field's parameters by name.
             inputs: names of the layers that read a point, such as "layers.0".
         """
@@ -77,11 +76,11 @@ class Autoencoder(HyperNetwork):
             theta: not read.
 
         Returns:
-            For each object what is added to the biases.
+            For each object, the offsets of the biases.
         """
         assert observed.images is not None
         assert observed.directions is not None
-        # z of each object, and what each layer that reads a point makes of it
+        # z of each object, and the offsets for each layer
         codes = self.encode(observed.images, observed.directions)
         read = [reader(codes) for reader in self.readers]
         return [
@@ -91,14 +90,14 @@ class Autoencoder(HyperNetwork):
 
     @property
     def activated(self) -> Sequence[nn.Module]:
-        """The layer that makes the code of an object."""
+        """The layer that computes the code of an object."""
         return [self.latent]
 
     def encode(
         self, images: Float[Tensor, "object view 3 height width"], directions: Float[Tensor, "object view 3"]
     ) -> Float[Tensor, "object latent"]:
         """The code z of each object."""
-        # a code an image, with its direction; all of them make that of the object
+        # the codes of all images with their directions make the code of the object
         apart = self.config.normalisation == "batch_statistics" and not self.training
         codes = encode_objects(self.encoder, images, apart=apart)
         return silu(self.latent(torch.cat([codes, directions], -1).flatten(1)))

@@ -1,4 +1,4 @@
-"""The interface of every hypernetwork: what is observed of some objects becomes an update of theta for each of them."""
+"""The interface of hypernetworks: from observations of several objects to an update of theta for each."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ __all__ = ["HyperNetwork", "Observed"]
 
 @dataclass(frozen=True)
 class Observed:
-    """What is seen of several objects; a hypernetwork reads the images or the volume.
+    """The inputs of a hypernetwork for several objects; it reads the images or the volume.
 
     Attributes:
         images: the HyperPlanes, RGB in [0, 1].
         directions: their unit viewing directions in the world.
-        present: which of the images there are, where objects have different numbers of them; all where None.
-        volume: what all views show on a grid over the scene.
+        present: mask of the images that are not padding, for objects with different numbers of them; all if None.
+        volume: all views projected onto a grid over the scene.
     """
 
     images: Float[Tensor, "object view 3 height width"] | None = None
@@ -35,10 +35,10 @@ class HyperNetwork(nn.Module):
     """H(observed, theta; delta) -> one tensor for each named parameter that is updated (HyperPlanes, Eq. 7).
 
     Attributes:
-        reads_volume: it reads `Observed.volume`, each object alone, and otherwise images with their directions.
-        views: k, how many images it reads of an object.
-        choice: which of the planes they are: the "farthest" apart, or the "first".
-        resolution: pixels a side that it wants images to have; 0 takes them as they are.
+        reads_volume: whether it reads `Observed.volume`, and each object alone; otherwise images with their directions.
+        views: k, the number of images that it reads of an object.
+        choice: which of the planes it reads: the "farthest" apart, or the "first".
+        resolution: pixels a side to which images are resized; 0 leaves them unchanged.
     """
 
     reads_volume: ClassVar[bool] = False
@@ -55,12 +55,12 @@ class HyperNetwork(nn.Module):
             theta: the target's parameters.
 
         Raises:
-            TypeError: a subclass that computes nothing.
+            TypeError: not defined by a subclass.
         """
-        raise TypeError(f"{type(self).__name__} does not say what it computes")
+        raise TypeError(f"{type(self).__name__} does not define forward")
 
     def standardised_codes(self, observed: Observed) -> Tensor | None:
-        """Codes of the objects in deviations of those of the training; None where nothing is standardised."""
+        """Codes of the objects, standardised over the training; None if they are not standardised."""
         return None
 
     @property

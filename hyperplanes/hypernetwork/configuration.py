@@ -1,4 +1,4 @@
-"""The shapes of hypernetworks, one dataclass for each kind; `docs/hypernetwork.md` has what each choice is worth."""
+"""The shapes of hypernetworks, one dataclass for each kind; docs/hypernetwork.md compares the choices."""
 
 from __future__ import annotations
 
@@ -30,30 +30,32 @@ class ImageHyperNetworkConfig:
 
     Attributes:
         code: length of the code of one image.
-        code_normalisation: of the codes: "running" standardises them by running statistics over objects, "none" leaves
-            them as they are.
-        depth: fully connected layers of the head before its outputs.
+        code_normalisation: of the codes: "running" standardises them with running statistics over objects, "none"
+            leaves them unchanged.
+        depth: fully connected layers of the head before its output layers.
         width: of each of them.
         activation: of the head: "relu" as in the paper, or "silu".
         layers: which layers of the target are updated: ("colour", "density") as in the paper, or ("all",).
-        update: how outputs become an update: "full" as in the paper, or "low_rank"; see `updates`.
+        update: form of the update: "full" as in the paper, or "low_rank"; see `updates`.
         rank: of "low_rank" updates.
-        see_weights: theta is an input.
-        weights_seen: how much of it: "updated", the weights of the layers that are updated, or "all". The paper says
+        see_weights: whether theta is an input.
+        weights_seen: which part of it: "updated", the weights of the layers that are updated, or "all". The paper says
             theta. It is the same for every object, so it carries no information about the object; in training it lets
             the update follow the weights it is added to.
-        centre: what the output layers read is standardised by running statistics over objects, and they have no bias:
-            the update has mean zero over objects, so that what is the same for every object can only go into theta.
-        views: k, the number of HyperPlanes it reads; the most it reads with a field that takes any number of views.
-        choice: which k of the n planes they are: the "farthest" apart, or the "first".
-        resolution: pixels a side that HyperPlanes are resized to before they are encoded, so that pictures of every
-            size are read alike; 0 leaves them as they are, and resizes those of a step to the size of its first object.
+        centre: whether inputs of the output layers are standardised with running statistics over objects, and these
+            layers have no bias. The update then has mean zero over objects, so that only theta can hold what all
+            objects share.
+        views: k, the number of HyperPlanes it reads; the largest number with a field that takes any number of views.
+        choice: which k of the n planes it reads: the "farthest" apart, or the "first".
+        resolution: pixels a side that HyperPlanes are resized to before encoding, so that all sizes are read alike; 0
+            keeps their size, and resizes all images of a training step to that of its first object.
         encoder: "convnet" (ShapeNet 128) or "resnet101" (ShapeNet 200).
-        normalisation: of the encoder: "batch" as in the paper, by running statistics in use; "batch_statistics", by the
-            statistics of the HyperPlanes at hand in use too, as the published code does; or "group", image by image.
-        join: how the codes of k images become one: "concatenate" as in the paper, or "mean", in which case each code is
-            joined with its viewing direction first and the order of the images does not matter.
-        see_directions: the viewing directions are an input.
+        normalisation: of the encoder: "batch" as in the paper, with running statistics in evaluation;
+            "batch_statistics", with those of the current HyperPlanes in evaluation too, as in the published code; or
+            "group", per image.
+        join: how the codes of k images are combined: "concatenate" as in the paper, or "mean", in which case each code
+            is first combined with its viewing direction, and the order of the images does not matter.
+        see_directions: whether the viewing directions are an input.
     """
 
     code: Annotated[int, range(1, 8193)] = 128
@@ -79,7 +81,7 @@ class ImageHyperNetworkConfig:
 @checked_fields
 @dataclass(frozen=True)
 class VolumeHyperNetworkConfig:
-    """A hypernetwork that reads what all views show on a grid over the scene (`VolumeHyperNetwork`); no settings."""
+    """A hypernetwork that reads all views projected onto a grid over the scene (`VolumeHyperNetwork`); no settings."""
 
 
 HyperNetworkConfig: TypeAlias = ImageHyperNetworkConfig | VolumeHyperNetworkConfig
@@ -88,4 +90,4 @@ KINDS: dict[str, type[ImageHyperNetworkConfig] | type[VolumeHyperNetworkConfig]]
     "images": ImageHyperNetworkConfig,
     "volume": VolumeHyperNetworkConfig,
 }
-"""By the entry `kind` of files of settings."""
+"""Configurations by the entry `kind` of settings files."""

@@ -1,4 +1,4 @@
-"""Encoders: an image and its viewing direction become a code."""
+"""Encoders: a code for each image."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ class ConvNet(nn.Module):
         self.code = nn.Linear(CHANNELS[-1] * 16, code)
 
     def forward(self, images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view code"]:
-        """One code an image; images in [0, 1] of any size."""
-        value = 1 - images  # so that the white background is zero
+        """One code per image; images in [0, 1] of any size."""
+        value = 1 - images  # makes the white background zero
         for convolution, normalisation in zip(self.convolutions, self.normalisations, strict=True):
             value = relu(normalisation(convolution(value)))
         return self.code(self.pool(value).flatten(1))
 
 
 class _Bottleneck(nn.Module):
-    """1x1, 3x3, 1x1 convolutions beside a shortcut (He et al. 2016, Fig. 5).
+    """1x1, 3x3 and 1x1 convolutions with a shortcut (He et al. 2016, Fig. 5).
 
-    The stride is that of the 3x3 convolution, as in torchvision (ResNet v1.5); the publication strides the first 1x1.
+    The 3x3 convolution has the stride, as in torchvision (ResNet v1.5); in the publication it is the first 1x1.
     """
 
     def __init__(self, before: int, narrow: int, stride: int, normalisation: Normalisation) -> None:
@@ -83,7 +83,7 @@ class _Bottleneck(nn.Module):
 
 
 class ResNet101(nn.Module):
-    """ResNet-101 with an output of chosen size (He et al. 2016; HyperPlanes, Appendix B)."""
+    """ResNet-101 with an output of a given size (He et al. 2016; HyperPlanes, Appendix B)."""
 
     def __init__(
         self, code: int, normalisation: Normalisation = "batch", blocks: tuple[int, ...] = (3, 4, 23, 3)
@@ -102,7 +102,7 @@ class ResNet101(nn.Module):
         self.code = nn.Linear(before, code)
 
     def forward(self, images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view code"]:
-        """One code an image; images in [0, 1] of any size."""
+        """One code per image; images in [0, 1] of any size."""
         return self.code(self.stages(self.stem(1 - images)).mean((2, 3)))
 
 
@@ -121,18 +121,17 @@ def encode_objects(
     Args:
         encoder: one of ENCODERS.
         images: in [0, 1].
-        present: which of the images there are, all where absent; the others are not encoded and count in no statistics
-            of a batch.
-        apart: every object is a batch of its own. Otherwise the images of all of them are one.
+        present: mask of the images to encode, by default all; the others are left out of batch statistics too.
+        apart: whether each object is a batch of its own; otherwise all images are one batch.
 
     Returns:
-        Codes, zero where there is no image.
+        Codes, zero for images that are not encoded.
     """
     if present is None:
         present = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
-    # images that are missing are not encoded
+    # missing images are not encoded
     batches = [each[there] for each, there in zip(images, present, strict=True)]
     codes = [encoder(batch) for batch in (batches if apart else [torch.cat(batches)])]
-    # zeros stand where they would be
+    # their codes are zeros
     found = torch.cat(codes)
     return found.new_zeros(*present.shape, found.shape[1]).masked_scatter(present[..., None], found)

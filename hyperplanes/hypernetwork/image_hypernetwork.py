@@ -1,4 +1,4 @@
-"""The hypernetwork that reads images: k of them, their viewing directions and theta make one update (Eq. 7)."""
+"""The hypernetwork that reads images: from k images, their viewing directions and theta to one update (Eq. 7)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["ImageHyperNetwork"]
 class ImageHyperNetwork(HyperNetwork):
     """H(I_1..I_k, d_1..d_k, theta; delta) = one tensor for each named parameter of the chosen layers.
 
-    The outputs start at zero: an untrained hypernetwork changes nothing.
+    Outputs are zero at initialisation: an untrained hypernetwork changes nothing.
 
     Args:
         config: the shape.
@@ -44,7 +44,7 @@ class ImageHyperNetwork(HyperNetwork):
             expected = f"('all',) or some of {sorted(known)}"
             raise ValueError(f"layers: expected {expected}, got {sorted(chosen - known) or 'none'}")
         self.shapes = {name: shape for name, shape in shapes.items() if name.split(".")[-2] in chosen}
-        # a code of every image, and of the object
+        # codes of the images, and of the object
         self.encoder = ENCODERS[config.encoder](config.code, config.normalisation)
         concatenated = config.join == "concatenate"
         shape = (config.views, config.code) if concatenated else (config.code,)
@@ -74,18 +74,18 @@ class ImageHyperNetwork(HyperNetwork):
         return list(self.head)
 
     def forward(self, observed: Observed, theta: Mapping[str, Tensor]) -> list[Parameters]:
-        """The update of theta for the objects that these HyperPlanes show.
+        """The update of theta for each object.
 
         Args:
-            observed: the HyperPlanes of each of several objects with their viewing directions. Some may be missing only
-                with join "mean", which takes any number of images.
+            observed: the HyperPlanes of several objects with their viewing directions. Some may be missing only with
+                join "mean", which takes any number of images.
             theta: the target's parameters.
 
         Returns:
-            For each object one tensor a named parameter of the chosen layers, of its shape.
+            For each object, one tensor for each named parameter of the chosen layers, of its shape.
 
         Raises:
-            ValueError: another number of images than the network was made for.
+            ValueError: a number of images other than `config.views`, with join "concatenate".
         """
         images, directions, config = observed.images, observed.directions, self.config
         assert images is not None
@@ -97,12 +97,12 @@ class ImageHyperNetwork(HyperNetwork):
                 f"HyperPlanes: expected {expected} images and directions, "
                 f"got {images.shape[-4]} and {directions.shape[-2]}"
             )
-        # codes of the images, joined with the directions; the head makes updates of them
+        # codes of the images, joined with the directions, are the input of the head
         codes = self.encode(images, directions, observed.present)
         return self._updates_of(self._joined(codes, directions), theta)
 
     def standardised_codes(self, observed: Observed) -> Tensor | None:
-        """The codes of the images in deviations of those of the training; None where they are not standardised so."""
+        """The codes of the images, standardised over the training; None if they are not standardised."""
         if not isinstance(self.code_normalisation, RunningStandardisation):
             return None
         assert observed.images is not None
@@ -116,20 +116,20 @@ class ImageHyperNetwork(HyperNetwork):
         present: Bool[Tensor, "object view"] | None = None,
     ) -> Float[Tensor, "object ..."]:
         """The codes of the images: (object, view, code), or (object, code) of their mean."""
-        # a code an image; with statistics of the batch, objects that are evaluated are batches of their own
+        # a code per image; with batch statistics, each object is a batch of its own in evaluation
         apart = self.config.normalisation == "batch_statistics" and not self.training
         codes = encode_objects(self.encoder, images, present, apart=apart)
         if self.config.join == "mean":
             if not self.config.see_directions:
                 directions = torch.zeros_like(directions)
-            # each image with its direction, then their mean over the images that there are
+            # each code with its direction, then their mean over the images that are present
             codes = silu(self.place(torch.cat([codes, directions], -1)))
             weights = codes.new_ones(codes.shape[:2]) if present is None else present.to(codes)
             codes = (weights[..., None] * codes).sum(1) / weights.sum(1, keepdim=True)
         return self.code_normalisation(codes)
 
     def _joined(self, codes: Tensor, directions: Tensor) -> Float[Tensor, "object read"]:
-        """What the head reads of the object: codes and viewing directions."""
+        """The inputs of the head: codes and viewing directions."""
         parts = [codes.flatten(1)]
         if self.config.join == "concatenate":
             seen = directions if self.config.see_directions else torch.zeros_like(directions)
@@ -137,16 +137,16 @@ class ImageHyperNetwork(HyperNetwork):
         return torch.cat(parts, 1)
 
     def _updates_of(self, read: Float[Tensor, "object read"], theta: Mapping[str, Tensor]) -> list[Parameters]:
-        """The updates of several objects, of what the head reads of each and of the target's parameters."""
+        """The updates of several objects from the inputs of the head and the target's parameters."""
         config = self.config
         activation = ACTIVATIONS[config.activation]
-        # the code of the object beside that of theta, through the fully connected layers
+        # the codes of the object and of theta, through the fully connected layers
         hidden = torch.cat([read, self._weights_read(theta).expand(len(read), -1)], 1)
         for layer in self.head:
             hidden = activation(layer(hidden))
-        if config.centre:  # of unit length on average, as what Adam moves an output by grows with it
+        if config.centre:  # of unit length on average, since the change of an output by an Adam step grows with it
             hidden = self.standardise(hidden) / config.width**0.5
-        # each parameter has an output layer of its own, and a form in which its update is written
+        # each parameter has its own output layer and form of update
         outputs = [output(hidden) for output in self.outputs]
         return [
             Parameters(

@@ -1,4 +1,4 @@
-"""A network that reads the gradient of an error and writes a step of gradient descent."""
+"""A network that reads the gradient of an error and outputs a step of gradient descent."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["LearnedStep"]
 class LearnedStep(nn.Module):
     """A learned step of gradient descent on a grid of features.
 
-    A network in place of a rate and an optimiser (Andrychowicz et al. 2016, "Learning to learn by gradient descent by
+    A network replaces learning rate and optimiser (Andrychowicz et al. 2016, "Learning to learn by gradient descent by
     gradient descent"; Flynn et al. 2019, "DeepView", for views of a scene). It is a U-Net like that of
-    `VolumeHyperNetwork`, with weights of its own. Its first step is none. `training.learned_step` trains it after the
-    model; it is no part of other trainings.
+    `VolumeHyperNetwork`, with its own weights. At initialisation its step is zero. `training.learned_step` trains it
+    after the model, and nothing else does.
 
     Args:
         side: cells of the grid an axis.
-        features: numbers that it has of a cell.
+        features: number of features of a cell.
     """
 
     def __init__(self, side: int, features: int) -> None:
@@ -40,10 +40,10 @@ class LearnedStep(nn.Module):
 
         Args:
             hull: share of each cell that the visual hull occupies, the first channel of `geometry.volume.volume_of`.
-            grid: features as they are.
-            gradient: of the error, in these features; of any scale.
+            grid: current features.
+            gradient: of the error with respect to the features, of any scale.
         """
-        # its scale says more of the number of rays than of the object, and it has heavy tails
+        # the scale of gradients depends more on the number of rays than on the object, and they have heavy tails
         scaled = gradient / gradient.square().mean((2, 3, 4), keepdim=True).sqrt().clamp_min(1e-12)
         scaled = scaled.sign() * scaled.abs().log1p()
         written = self.network(torch.cat([hull, grid, scaled], 1))

@@ -27,7 +27,7 @@ def make_hypernetwork(
         config: its shape.
         shapes: of the target's parameters by name.
         reading_layers: names of the target's layers that read a point.
-        volume_size: channels and cells an axis of the volumes that are to be read.
+        volume_size: channels and cells an axis of the volumes that it reads.
     """
     if isinstance(config, AutoencoderConfig):
         return Autoencoder(config, shapes, reading_layers)

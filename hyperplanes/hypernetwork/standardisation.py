@@ -14,18 +14,18 @@ EPSILON = 1e-5  # added to the variance
 
 
 class RunningStandardisation(nn.Module):
-    """Batch renormalisation (Ioffe 2017) over objects, without an affine part.
+    """Batch renormalisation (Ioffe 2017) over objects, without affine parameters.
 
-    The value is (code - running mean) / running standard deviation, in training as in evaluation; the gradient is that
-    of normalising by the statistics of the objects of the step, so that nothing is learned of what is the same for all
-    of them. A step of a single object has no such statistics; there, the running ones are constants.
+    The value is (code - running mean) / running standard deviation in training and evaluation. The gradient is that of
+    normalising with the statistics of the objects of the step, so that nothing is learned from what they share. With a
+    single object there are no such statistics, and the running ones are constants.
 
-    Without it, codes of different objects of one class differ by about 2 % of what they have in common, and what they
-    have in common is what the layers after it learn to use: docs/hypernetwork.md.
+    Without it, codes of different objects of one class differ by about 2 % of what they share, and later layers learn
+    to use what they share: docs/hypernetwork.md.
 
     Args:
         shape: of the codes of one object.
-        momentum: weight of the newest step in the statistics; the first 1 / momentum steps are averaged evenly.
+        momentum: weight of the newest step in the statistics; the first 1 / momentum steps have equal weights.
     """
 
     mean: Tensor
@@ -40,7 +40,7 @@ class RunningStandardisation(nn.Module):
         self.register_buffer("steps", torch.zeros(()))
 
     def forward(self, codes: Float[Tensor, "object ..."]) -> Float[Tensor, "object ..."]:
-        """Codes of mean 0 and variance 1 over the objects of the training; updates the statistics in training."""
+        """Codes with mean 0 and variance 1 over the training objects; in training, this updates the statistics."""
         if not self.training:
             return self._standardised(codes)
         codes, own = gather_objects(codes)
@@ -71,6 +71,6 @@ class RunningStandardisation(nn.Module):
             return
         before = codes - self.mean
         self.mean += weight * before.mean(0)
-        # a single object of the first step has no variance: the first that is measured replaces that of the start
+        # a first step with a single object has no variance: the first one measured replaces the initial one
         first = bool(self.steps == 2) and bool((self.variance == 1).all())
         self.variance += (1.0 if first else weight) * ((before * (codes - self.mean)).mean(0) - self.variance)

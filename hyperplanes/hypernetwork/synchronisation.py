@@ -1,7 +1,7 @@
-"""Statistics over the objects of a step where processes share these objects; alone, a process has them all.
+"""Statistics over the objects of a step that are distributed over processes; without others, a process has them all.
 
-The processes are those of torch.distributed's default group. In training, all of them come here equally often, in the
-same order; in evaluation nothing is exchanged.
+The processes are those of the default group of torch.distributed. In training, all must call these functions equally
+often and in the same order; in evaluation nothing is exchanged.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def is_shared() -> bool:
 
 
 class _Sum(torch.autograd.Function):
-    """The sum over processes; every process's loss counts, so its gradient is the sum of theirs."""
+    """The sum over processes; the losses of all processes count, so the gradient is the sum of theirs."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -36,7 +36,7 @@ class _Sum(torch.autograd.Function):
 
 
 def sum_over_processes(value: Tensor) -> Tensor:
-    """The sum of what each process has, with its gradient."""
+    """The sum over processes, with its gradient."""
     return _Sum.apply(value)  # pyright: ignore[reportReturnType]
 
 
@@ -44,10 +44,10 @@ def gather_objects(values: Tensor) -> tuple[Tensor, slice]:
     """The values of the objects of all processes.
 
     Args:
-        values: (object, ...) of the objects of this process; as many as each other process has.
+        values: (object, ...) of the objects of this process; all processes have the same number.
 
     Returns:
-        Those of all, process after process, with their gradient, and where this process's own ones are.
+        The values of all processes in order, with their gradient, and the slice of those of this process.
     """
     if not is_shared():
         return values, slice(None)
@@ -59,20 +59,20 @@ def gather_objects(values: Tensor) -> tuple[Tensor, slice]:
 
 
 class BatchNorm2d(nn.BatchNorm2d):
-    """Batch normalisation whose statistics in training are those of the images of all processes.
+    """Batch normalisation with statistics over the images of all processes in training.
 
-    torch.nn.SyncBatchNorm computes the same, on GPUs alone.
+    torch.nn.SyncBatchNorm does the same, but only on GPUs.
     """
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - torch's name
-        """As torch.nn.BatchNorm2d; ValueError where the statistics would be those of a single value."""
+        """As torch.nn.BatchNorm2d; ValueError if the statistics would be those of a single value."""
         if not self.training or not is_shared():
             if (self.training or not self.track_running_stats) and input.numel() == input.shape[1]:
                 kind = "batch" if self.track_running_stats else "batch_statistics"
                 raise ValueError(
                     "hypernetwork.normalisation or autoencoder.normalisation: expected 'group' for one small image "
-                    f"at a time, got {kind!r}, which compares the values of a channel, of which there is one; or "
-                    "take more images by views or training.tasks"
+                    f"at a time, got {kind!r}, which needs more than one value per channel; or use more images, with "
+                    "views or training.tasks"
                 )
             return super().forward(input)
         axes = (0, 2, 3)

@@ -1,4 +1,4 @@
-"""Forms of an update: how outputs of a hypernetwork become the update of one parameter of the target."""
+"""Forms of an update: from outputs of a hypernetwork to the update of one parameter of the target."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["UPDATES", "FullUpdate", "LowRankUpdate"]
 
 
 class FullUpdate(nn.Module):
-    """Every number of the parameter is an output, as in the paper.
+    """Every element of the parameter is an output, as in the paper.
 
     Args:
         shape: of the parameter.
@@ -24,15 +24,15 @@ class FullUpdate(nn.Module):
         self.size = shape.numel()
 
     def forward(self, outputs: Float[Tensor, " size"], parameter: Tensor) -> Tensor:
-        """The outputs in the parameter's shape."""
+        """The outputs in the shape of the parameter."""
         return outputs.reshape(parameter.shape)
 
 
 class LowRankUpdate(nn.Module):
     """Rows are scaled, and a product of thin matrices is added: delta W = diag(s) W + U V, delta b = t.
 
-    s and t modulate what a layer computes as FiLM does (Perez et al. 2018), U V is one as LoRA's (Hu et al. 2022): U
-    (row, rank) is an output; V (rank, column) is learned and the same for all objects.
+    s and t modulate a layer as in FiLM (Perez et al. 2018), and U V is as in LoRA (Hu et al. 2022): U (row, rank) is an
+    output, V (rank, column) is learned and shared by all objects.
 
     Args:
         shape: of the parameter.
@@ -50,7 +50,7 @@ class LowRankUpdate(nn.Module):
             self.right = random_matrix(rank, shape[1], shape[1])
 
     def forward(self, outputs: Float[Tensor, " size"], parameter: Tensor) -> Tensor:
-        """diag(s) W + U V of a matrix, the outputs of a bias."""
+        """diag(s) W + U V for a matrix, the outputs for a bias."""
         if not self.rank:
             return outputs
         scale, left = outputs.reshape(len(parameter), 1 + self.rank).split([1, self.rank], 1)

@@ -1,4 +1,4 @@
-"""A hypernetwork that reads what all views show on a grid over the scene, instead of images one by one."""
+"""A hypernetwork that reads all views projected onto a grid over the scene, instead of images."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ __all__ = ["VolumeHyperNetwork"]
 
 
 class VolumeHyperNetwork(HyperNetwork):
-    """H(V; delta), where V is what all views show on a grid over the scene (`geometry.volume.volume_of`).
+    """H(V; delta), where V has all views projected onto a grid over the scene (`geometry.volume.volume_of`).
 
-    The grid of features among the weights of the target gets an update for every cell, from the convolutions of
-    `VolumeNetwork`; it starts at zero. Neither the number of the views nor their order matters. Updates of the other
-    layers brought nothing beside that of the grid (docs/image-based.md), so there are none, and theta is not read.
+    `VolumeNetwork` outputs an update for every cell of the grid of features among the weights of the target; it is zero
+    at initialisation. The number and order of the views do not matter. Updating other layers as well gained nothing
+    (docs/image-based.md), so they are not updated, and theta is not read.
 
     Args:
         shapes: of the parameters by name; those of four dimensions are grids of features, with as many cells as V.
-        channels: numbers that V has of a cell.
+        channels: of V.
         side: cells of V an axis.
     """
 
@@ -36,13 +36,13 @@ class VolumeHyperNetwork(HyperNetwork):
         self.encoder = VolumeNetwork(channels, side, sum(shape[0] for shape in self.grids.values()))
 
     def forward(self, observed: Observed, theta: Mapping[str, Tensor]) -> list[Parameters]:
-        """The update of the grids for each of several objects: one tensor a grid, of its shape.
+        """The update of the grids for each of several objects: one tensor for each grid, of its shape.
 
         Args:
             observed: the volumes of the objects.
             theta: the target's parameters, which are not read.
         """
         assert observed.volume is not None
-        # one volume of features, cut into the grids by channels
+        # one volume of features, split into the grids by channels
         features = self.encoder(observed.volume).split([shape[0] for shape in self.grids.values()], 1)
         return [Parameters(zip(self.grids, each, strict=True)) for each in zip(*features, strict=True)]

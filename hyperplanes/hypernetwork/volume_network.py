@@ -1,4 +1,4 @@
-"""The network that reads what all views show on a coarse grid, and writes features of every cell."""
+"""A network from a volume over the scene to features of every cell."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["VolumeNetwork"]
 
-FOLD = 2  # cells an axis that become channels before the first convolution
+FOLD = 2  # cells an axis that are folded into channels before the first convolution
 WIDTHS = (32, 64, 128)  # channels at half, a quarter and an eighth of the side
 GROUPS = 8  # of the normalisation
 
 
 class _Convolution(nn.Conv3d):
-    """A 3x3x3 convolution with zeros around its input.
+    """A 3x3x3 convolution with zero padding.
 
-    The zeros before and behind are put there by hand, the others by the convolution: oneDNN, which PyTorch convolves
-    with on CPUs, has a fast gradient of the weights of 3D convolutions only where their depth is not padded. Those of
-    32 channels on four grids of 16 cells an axis take 13 ms in place of 24 (one thread, AVX2). PyTorch convolves a
-    single small volume without oneDNN, which is asked for by name here: forward 1.2 ms in place of 6.0 for 32 channels
-    on 16 cells an axis (one thread, AVX-512). Backward it stays without.
+    The depth is padded separately: oneDNN, which PyTorch uses for convolutions on CPUs, has a fast weight gradient of
+    3D convolutions only without padded depth. For 32 channels on four grids of 16 cells an axis it takes 13 ms instead
+    of 24 (one thread, AVX2). For a single small volume PyTorch does not use oneDNN, so it is called directly: forward
+    1.2 ms instead of 6.0 for 32 channels on 16 cells an axis (one thread, AVX-512). Backward it is not used.
 
     Args:
         before: channels of the input.
-        after: of the output.
-        stride: of the output's cells.
+        after: channels of the output.
+        stride: in cells.
     """
 
     def __init__(self, before: int, after: int, stride: int = 1) -> None:
@@ -36,7 +35,7 @@ class _Convolution(nn.Conv3d):
 
     def forward(self, input: Tensor) -> Tensor:
         """The convolution."""
-        if torch.is_autocast_enabled("cpu"):  # in bfloat16 padded depths are as fast
+        if torch.is_autocast_enabled("cpu"):  # in bfloat16 a padded depth is as fast
             return super().forward(input)
         padded = pad(input, (0, 0, 0, 0, 1, 1))
         if len(input) == 1 and _has_onednn(input):
@@ -45,13 +44,13 @@ class _Convolution(nn.Conv3d):
 
 
 def _has_onednn(value: Tensor) -> bool:
-    """Whether oneDNN may be asked for by name: in single precision on a CPU, by no compiler and under no transform."""
+    """Whether oneDNN may be called directly: in float32 on a CPU, outside torch.compile and torch.func."""
     kind = (value.device.type, value.dtype) == ("cpu", torch.float32)
     return kind and torch.backends.mkldnn.is_available() and torch.backends.mkldnn.enabled and are_plain(value)
 
 
 class _Pointwise(nn.Conv3d):
-    """A 1x1x1 convolution, as a product of matrices; with it a step back and forth takes two thirds of the time.
+    """A 1x1x1 convolution as a matrix product, with which forward and backward take two thirds of the time.
 
     Args:
         before: channels of the input.
@@ -62,7 +61,7 @@ class _Pointwise(nn.Conv3d):
         super().__init__(before, after, 1)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """The convolution of what the inputs are side by side, without putting them there."""
+        """The convolution of the concatenated inputs, without copying them."""
         assert self.bias is not None
         total, weights = self.bias[:, None], self.weight.flatten(1).split([each.shape[1] for each in inputs], 1)
         for each, weight in zip(inputs, weights, strict=True):
@@ -71,7 +70,7 @@ class _Pointwise(nn.Conv3d):
 
 
 class _Residual(nn.Module):
-    """A 3x3x3 and a 1x1x1 convolution, each after normalisation and SiLU, beside a shortcut."""
+    """A 3x3x3 and a 1x1x1 convolution, each after normalisation and SiLU, with a shortcut."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -91,16 +90,16 @@ class _Residual(nn.Module):
 class VolumeNetwork(nn.Module):
     """A U-Net (Ronneberger et al. 2015; Cicek et al. 2016 in 3D) on a grid.
 
-    Blocks of FOLD cells an axis are channels of one, so that the finest convolutions are those of half the side; the
-    features of their cells are unfolded again at the end. The features start at zero.
+    Blocks of FOLD cells an axis are folded into channels, so that the finest convolutions are at half the resolution,
+    and unfolded at the end. Outputs are zero at initialisation.
 
     Args:
-        channels: numbers that are read of a cell.
+        channels: of the input.
         side: cells an axis, a multiple of eight.
-        features: of every cell.
+        features: channels of the output.
 
     Raises:
-        ValueError: another side.
+        ValueError: `side` is not a multiple of eight.
     """
 
     def __init__(self, channels: int, side: int, features: int) -> None:
@@ -121,16 +120,16 @@ class VolumeNetwork(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, volumes: Float[Tensor, "object channel x y z"]) -> Float[Tensor, "object feature x y z"]:
-        """The features of every cell for each of several objects."""
+        """The features of every cell, for several objects."""
         # to half, a quarter and an eighth of the side
         folded = _fold(volumes)
         fine = self.downwards[0](self.first(folded))
         middle = self.downwards[1](self.strided[0](fine))
         coarse = self.downwards[2](self.strided[1](middle))
-        # and back to half, each with the features of the same side added
+        # and back to half, adding the features of the same side
         middle = self.upwards[1](middle + _doubled(self.widened[0](self.upwards[0](coarse))))
         fine = self.upwards[2](fine + _doubled(self.widened[1](middle)))
-        # the features of every cell, read beside what the cell showed
+        # the output layer also reads the input
         return _unfold(self.last(silu(self.normalisation(fine)), folded), self.features)
 
 

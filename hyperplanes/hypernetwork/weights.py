@@ -1,4 +1,4 @@
-"""How the hypernetwork reads theta: a code of the target's own weights (HyperPlanes, Eq. 7)."""
+"""How a hypernetwork reads theta: a code of the weights of the target (HyperPlanes, Eq. 7)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ RANK = 4
 
 
 class LowRankReader(nn.Module):
-    """Every weight of a network becomes one code, by few learned numbers.
+    """One code for all weights of a network, with few learned parameters.
 
-    Of a matrix W (out x in) the products U W V are read, U (4 x out) and V (in x 4) being learned, 16 numbers; of a
-    bias b as many, U b; grids of features are left out. A linear layer makes the code of all of them. At depth 8 and
-    width 256 that is a hundred thousand learned numbers, where a linear layer over theta itself would take 80 million.
+    Each matrix W (out x in) is projected to U W V, 16 numbers, with learned U (4 x out) and V (in x 4), each bias b to
+    U b, also 16; grids of features are left out. A linear layer computes the code from these. At depth 8 and width 256
+    this has a hundred thousand parameters; a linear layer over theta itself would have 80 million.
 
     Args:
         shapes: of the parameters by name.
@@ -46,15 +46,15 @@ class LowRankReader(nn.Module):
 
 
 def random_matrix(rows: int, columns: int, summed: int) -> nn.Parameter:
-    """Normal values whose products with as many numbers as are summed stay as large as these.
+    """A matrix of normal values with variance 1 / `summed`, which keeps the scale of its products.
 
-    On the device "meta" there are none, as when a checkpoint is read: PyTorch would load its compiler for them, in a
-    second.
+    On the device "meta", as when a checkpoint is read, it has no values: drawing them would make PyTorch load its
+    compiler, which takes a second.
 
     Args:
-        rows: their number.
-        columns: their number.
-        summed: how many numbers a product adds up.
+        rows: number of rows.
+        columns: number of columns.
+        summed: number of terms in each sum of a product.
     """
     values = torch.empty(rows, columns)
     return nn.Parameter(values if values.is_meta else values.normal_().div_(summed**0.5))

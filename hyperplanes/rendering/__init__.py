@@ -1,4 +1,4 @@
-"""Volume rendering of any field given as a callable (points, directions) -> (colour, density)."""
+"""Volume rendering of any callable (points, directions) -> (colour, density)."""
 
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
 from hyperplanes.rendering.hierarchical import Hierarchical, importance, intervals, stratified

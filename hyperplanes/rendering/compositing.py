@@ -1,4 +1,4 @@
-"""Alpha compositing of samples along rays: dense, (ray, sample), and packed, one row a sample of any ray."""
+"""Alpha compositing of samples along rays: dense, (ray, sample), and packed, one row per sample."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 __all__ = ["Rendered", "composite", "composite_packed", "packed_weights"]
 
-MAX_OPTICAL_DEPTH = 1e3  # of a sample: exp(-1000) is 0, and the running sum over all rays stays exact
+MAX_OPTICAL_DEPTH = 1e3  # of a sample: exp(-1000) is 0, and the cumulative sum over all rays stays accurate
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Rendered:
         opacity: 1 - the transmittance of the whole ray.
         depth: expected distance along the ray in world units, sum of w t / opacity; 0 where the opacity is 0.
         samples: number of field evaluations, over all rays.
-        coarse: the pixels of the coarse pass, where there was one; training has a loss on their colour too.
+        coarse: the pixels of the coarse pass, if there was one; training has a loss on their colour too.
     """
 
     colour: Float[Tensor, "ray 3"]
@@ -32,7 +32,7 @@ class Rendered:
     coarse: Rendered | None = None
 
     def over(self, background: Float[Tensor, " 3"]) -> Rendered:
-        """The same pixels, rendered over white, over another colour; those of the coarse pass too."""
+        """The pixels, rendered over white, composited over another colour; those of the coarse pass too."""
         colour = self.colour + (1 - self.opacity)[:, None] * (background - 1)
         return replace(self, colour=colour, coarse=self.coarse and self.coarse.over(background))
 
@@ -66,7 +66,7 @@ def composite(
         density: of each sample, per world unit.
         edges: of the intervals that the samples stand for, ascending; delta_i is the length of each.
         background: grey value behind everything.
-        distances: of the samples along their rays, for the depth; the middles of the intervals where absent.
+        distances: of the samples along their rays, for the depth; by default the middles of the intervals.
 
     Returns:
         The pixels, and the weights for importance sampling.
@@ -75,11 +75,11 @@ def composite(
     optical_depth = density * edges.diff(dim=1)
     before = torch.cat([torch.zeros_like(optical_depth[:, :1]), optical_depth.cumsum(1)], 1)
     transmittance = torch.exp(-before)
-    # what each interval takes away of the light: T_i (1 - exp(-sigma_i delta_i)) = T_i - T_{i+1}
+    # weights T_i (1 - exp(-sigma_i delta_i)) = T_i - T_{i+1}
     weights = transmittance[:, :-1] - transmittance[:, 1:]
     opacity = 1 - transmittance[:, -1]
     distances = (edges[:, 1:] + edges[:, :-1]) / 2 if distances is None else distances
-    # mean distance of what is seen; the background fills what is left of the pixel
+    # mean distance of what is seen; the background fills the rest of the pixel
     depth = (weights * distances).sum(1) / opacity.clamp_min(1e-10)
     pixels = (weights[..., None] * colour).sum(1) + (1 - opacity)[:, None] * background
     return Rendered(pixels, opacity, depth, density.numel()), weights
@@ -96,12 +96,12 @@ def packed_weights(
         count: number of rays.
 
     Returns:
-        w_i as in `composite`. A density that is infinite or not a number affects its own ray only.
+        w_i as in `composite`. An infinite density or NaN affects only its own ray.
     """
     if not len(optical_depth):
         return optical_depth
-    # One running sum over all rays, in double precision so that a ray late in the batch loses nothing, less its value
-    # where the ray begins.
+    # one cumulative sum over all rays, minus its value at the start of each ray; in double precision so that rays late
+    # in the batch stay accurate
     finite = optical_depth.double().nan_to_num(0.0).clamp_max(MAX_OPTICAL_DEPTH)
     before = finite.cumsum(0) - finite
     first = torch.searchsorted(ray, torch.arange(count, device=ray.device)).clamp_max(len(ray) - 1)

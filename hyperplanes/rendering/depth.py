@@ -1,4 +1,4 @@
-"""What the depth of pictures says about the surface that they show: z coordinates, places and normals."""
+"""The visible surface from the depth of pictures: z coordinates, points and normals."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from hyperplanes.utilities.arguments import checked
 
 __all__ = ["SeenSurface", "seen_surface"]
 
-COVERED = 0.5  # opacity from which on a pixel shows a surface
-REACH = 2  # pixels to every side that the plane through a pixel is fitted to
-STEEPEST = 6.0  # change of z in widths of a pixel, per pixel; more is another surface
-RIDGE = 1e-3  # of the normal equations, for pixels that have no neighbours
+COVERED = 0.5  # least opacity of a pixel that shows a surface
+REACH = 2  # pixels on each side to which the plane through a pixel is fitted
+STEEPEST = 6.0  # largest change of z from pixel to pixel on one surface, in widths of a pixel
+RIDGE = 1e-3  # regularisation of the normal equations, for pixels without neighbours
 
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """The surface that pictures show; zero where they show none.
+    """The visible surface of pictures; zero in pixels without one.
 
     Attributes:
-        z: coordinate along the optical axis of each camera, in world units, as data sets call depth.
+        z: coordinate along the optical axis of each camera, in world units, which data sets call depth.
         points: in the world.
         normals: unit vectors in the world, towards the camera.
-        covered: where there is a surface.
+        covered: 1 where there is a surface.
     """
 
     z: Float[Tensor, "view height width"]
@@ -43,18 +43,17 @@ class SeenSurface:
 @checked
 @torch.no_grad()
 def seen_surface(pictures: Pictures, cameras: PinholeCamera) -> SeenSurface:
-    """The surface that pictures show, from their depth along the rays.
+    """The visible surface of pictures, from their depth along the rays.
 
-    Over a plane, 1 / z is linear in the coordinates (x / z, y / z) of the rays, whatever the lens. So the normal of a
-    pixel is that of the plane fitted by least squares to 1 / z of the 5 x 5 pixels around it, without those that lie on
-    another surface.
+    On a plane, 1 / z is linear in the coordinates (x / z, y / z) of the rays, for any lens. So the normal of a pixel is
+    that of the plane fitted by least squares to 1 / z of the 5 x 5 pixels around it, without those on another surface.
 
     Args:
         pictures: of a field.
-        cameras: which took them.
+        cameras: of the pictures.
 
     Raises:
-        ValueError: cameras of other pictures.
+        ValueError: cameras of another number or size.
     """
     expected = (cameras.batch_size, *(camera.image_size(cameras) if cameras.batch_size else ()))
     shape = (len(pictures.depth), *pictures.depth.shape[2:])
@@ -82,7 +81,7 @@ def _one_view(pictures: Pictures, cameras: PinholeCamera, view: int) -> tuple[Te
 
 
 def _plane_normals(z: Tensor, covered: Tensor, opacity: Tensor, slopes: Tensor, focal: float) -> Tensor:
-    """Normals in the camera's frame, by weighted least squares over the pixels around each."""
+    """Normals in the camera's frame, by weighted least squares over the pixels around each pixel."""
     height, width = z.shape
     weight = covered * opacity
     frame = [REACH] * 4
@@ -92,7 +91,7 @@ def _plane_normals(z: Tensor, covered: Tensor, opacity: Tensor, slopes: Tensor, 
         for across in range(2 * REACH + 1):
             there, share, x, y = (part[down : down + height, across : across + width] for part in around)
             near = (there - z).abs() <= STEEPEST * REACH * z / focal
-            # pixels from the centre, and 1 / z relative to that of the centre
+            # offset from the centre in pixels, and 1 / z relative to that of the centre
             offset = torch.stack([(x - slopes[..., 0]) * focal, (y - slopes[..., 1]) * focal, torch.ones_like(x)], -1)
             offset = offset * (share * near)[..., None].sqrt()
             change = (share * near).sqrt() * (z / there.clamp_min(1e-12) - 1)

@@ -25,8 +25,8 @@ __all__ = ["footprint", "pixels_across"]
 
 
 def pixels_across(cameras: PinholeCamera, bounds: Sphere) -> float:
-    """How many pixels the diameter of a sphere takes where it is seen largest; from within, as from its surface."""
-    camera.image_size(cameras)  # refuses no cameras at all
+    """The diameter of a sphere in pixels, in the view where it is largest; from inside, as seen from its surface."""
+    camera.image_size(cameras)  # raises without cameras
     distance = (camera.centres(cameras) - camera.centres(cameras).new_tensor(bounds.centre)).norm(dim=1)
     focal = camera.intrinsics(cameras)[:, 0, 0]
     return float((2 * bounds.radius * focal / distance.clamp_min(bounds.radius)).max())
@@ -37,9 +37,9 @@ def pixels_across(cameras: PinholeCamera, bounds: Sphere) -> float:
 def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "view height width"]:
     """The pixels whose rays may cross an occupied voxel; every other pixel is background.
 
-    The centres of the voxels at the surface are projected and dilated by the largest extent of a voxel in that view, so
-    that no pixel is missed.
-    All pixels of a view count where a voxel lies beside or behind the camera, or where the camera has lens distortion.
+    The centres of the surface voxels are projected and dilated by the largest extent of a voxel in that view, so that
+    no pixel is missed. If a voxel lies beside or behind the camera, or the camera has lens distortion, all pixels of a
+    view are included.
     """
     height, width = camera.image_size(cameras)
     if isinstance(cameras, DistortedCamera) and occupancy.occupied.any():
@@ -67,13 +67,13 @@ def _mark_torch(seen: Tensor, points: Tensor, matrices: Tensor, calibrations: Te
     """As `_mark_compiled`, in plain PyTorch."""
     height, width = seen.shape[1:]
     for view, matrix in enumerate(matrices):
-        # centres of the voxels at the surface, in pixels of the view; everything where one is too near
+        # centres of the surface voxels, in pixels of the view; all pixels if one is too near
         homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
         if float(homogeneous[:, 2].min()) < 2 * voxel:
             seen[view] = True
             continue
         pixels = homogeneous[:, :2] / homogeneous[:, 2:]
-        # half sizes of the boxes around what the voxels' balls cover; those that meet the image
+        # half sizes of the boxes around the projected balls of voxels; which of them meet the image
         extent = ball_extent(pixels, homogeneous[:, 2], calibrations[view], voxel * math.sqrt(3) / 2)
         touching = ((pixels + extent >= 0) & (pixels - extent <= pixels.new_tensor([width - 1, height - 1]))).all(-1)
         if not touching.any():
@@ -82,7 +82,7 @@ def _mark_torch(seen: Tensor, points: Tensor, matrices: Tensor, calibrations: Te
         if across > width or down > height:
             seen[view] = True
             continue
-        # each centre's pixel, spread by the largest of these boxes
+        # the pixel of each centre, dilated by the largest of these boxes
         padded = torch.zeros(height + 2 * down, width + 2 * across, device=points.device)
         column, row = pixels[touching].round().long().unbind(-1)
         padded[row + down, column + across] = 1.0

@@ -1,7 +1,7 @@
-"""NeRF's hierarchical sampling: stratified samples on every ray, then more of them where their weight is.
+"""NeRF's hierarchical sampling: stratified samples on every ray, then more samples where their weights are high.
 
-Vocabulary: `edges` are distances that cut a ray into intervals, (ray, interval + 1), ascending; a sample stands for its
-interval; `weights` are the compositing weights of the intervals, (ray, interval).
+Vocabulary: `edges` are distances that divide a ray into intervals, (ray, interval + 1), ascending; a sample stands for
+its interval; `weights` are the compositing weights of the intervals, (ray, interval).
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ __all__ = ["Hierarchical", "importance", "intervals", "stratified"]
 @checked_fields
 @dataclass(frozen=True)
 class Hierarchical:
-    """The paper's sampler: the same number of samples on every ray, of a coarse and of a fine pass.
+    """The paper's sampler: the same number of samples on every ray, in a coarse and a fine pass.
 
     Attributes:
-        coarse: stratified samples a ray.
-        fine: importance samples a ray.
-        placement: where the field is evaluated. "intervals": importance samples cut the coarse intervals further, and
-            the field is evaluated once in each of the coarse + fine intervals. "samples", as in NeRF: at the coarse and
-            the fine samples themselves, each of which stands for the way to the next, the last for the way to far.
+        coarse: stratified samples per ray.
+        fine: importance samples per ray.
+        placement: where the field is evaluated. "intervals": importance samples divide the coarse intervals further,
+            and the field is evaluated once in each of the coarse + fine intervals. "samples", as in NeRF: at the coarse
+            and fine samples themselves, each of which stands for the distance to the next, or to far.
     """
 
     coarse: Annotated[int, range(1, 16385)] = 64
@@ -71,13 +71,13 @@ class Hierarchical:
 
     @property
     def stop(self) -> float:
-        """Never: the paper evaluates every sample."""
+        """0: the paper evaluates every sample."""
         return 0.0
 
     def place(
         self, rays: Rays, occupancy: Occupancy | None = None, generator: torch.Generator | None = None
     ) -> DenseSamples:
-        """The coarse pass: stratified samples; `occupancy` is not read."""
+        """The coarse pass: stratified samples; `occupancy` is not used."""
         edges = intervals(rays, self.coarse)
         places = stratified(edges, generator)
         if self.placement == "samples":
@@ -87,7 +87,7 @@ class Hierarchical:
     def refine(
         self, rays: Rays, samples: DenseSamples, weights: Tensor, generator: torch.Generator | None = None
     ) -> DenseSamples | None:
-        """The fine pass: the coarse samples or intervals and those that are drawn where the weight is."""
+        """The fine pass: the coarse samples or intervals with those drawn in proportion to the weights."""
         if not self.fine:
             return None
         if self.placement == "samples":  # drawn between the middles of the coarse samples (NeRF, section 5.2)
@@ -106,10 +106,10 @@ def intervals(rays: Rays, count: int) -> Float[Tensor, "ray edge"]:
 
     Args:
         rays: with near <= far.
-        count: intervals a ray.
+        count: intervals per ray.
 
     Returns:
-        count + 1 edges a ray; the first is near, the last far.
+        count + 1 edges per ray; the first is near, the last far.
     """
     fraction = torch.linspace(0, 1, count + 1, dtype=rays.near.dtype, device=rays.near.device)
     return rays.near[:, None] + (rays.far - rays.near)[:, None] * fraction
@@ -118,14 +118,13 @@ def intervals(rays: Rays, count: int) -> Float[Tensor, "ray edge"]:
 def stratified(
     edges: Float[Tensor, "ray edge"], generator: torch.Generator | None = None
 ) -> Float[Tensor, "ray interval"]:
-    """One distance in each interval, uniform within it where a generator is given (NeRF, Eq. 2).
+    """One distance in each interval, uniformly distributed if a generator is given (NeRF, Eq. 2).
 
-    A sample stands for the whole of its interval, so the sum over samples of density times length is right on average,
-    whatever the density.
+    Each sample stands for its whole interval, so the sum over samples of density times length is unbiased.
 
     Args:
         edges: of the intervals, ascending.
-        generator: on the CPU; without one the samples are the middles.
+        generator: on the CPU; without one, samples are the middles.
 
     Returns:
         Ascending distances.
@@ -147,24 +146,24 @@ def importance(
     Args:
         edges: of the coarse intervals.
         weights: of the coarse intervals; no gradient flows through them.
-        count: new distances a ray.
-        generator: on the CPU; without one the quantiles are evenly spaced.
+        count: new distances per ray.
+        generator: on the CPU; without one, quantiles are evenly spaced.
 
     Returns:
-        Ascending distances within the edges.
+        Ascending distances between the edges.
     """
-    # the cumulative distribution over the intervals of each ray; no interval is impossible
+    # the cumulative distribution over the intervals of each ray; every interval has some probability
     mass = weights.detach() + 1e-5
     cumulative = torch.cat([torch.zeros_like(mass[:, :1]), mass.cumsum(1)], 1)
     cumulative = cumulative / cumulative[:, -1:]
-    # as many quantiles as distances, evenly spaced, or each random within its share
+    # one quantile per distance, evenly spaced or stratified
     if generator is None:
         quantile = (torch.arange(count, dtype=edges.dtype, device=edges.device) + 0.5) / count
         quantile = quantile.expand(len(edges), -1).contiguous()
     else:
         offset = torch.rand(len(edges), count, generator=generator).to(edges)
         quantile = (torch.arange(count, dtype=edges.dtype, device=edges.device) + offset) / count
-    # the interval that each quantile falls into, and the place within it
+    # the interval of each quantile, and the position in it
     above = torch.searchsorted(cumulative, quantile, right=True).clamp(1, mass.shape[1])
     low, high = cumulative.gather(1, above - 1), cumulative.gather(1, above)
     start, end = edges.gather(1, above - 1), edges.gather(1, above)

@@ -1,4 +1,4 @@
-"""Images of a field: the loop over cameras and pixels."""
+"""Pictures of a field: the loop over cameras and pixels."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ BYTES_OF_VIEW, BYTES_KEPT = 200, 32
 """Bytes a pixel takes: for the rays of the view being rendered, and for the finished pictures of all views."""
 
 RAYS_OF_GROUP = 1 << 14
-"""Rays that small views are rendered together up to: by two threads 25 views of 64x64 take 0.94 s so, and 1.78 one by
-one (`small`, idle)."""
+"""Most rays of small views that are rendered together: with two threads, 25 views of 64x64 take 0.94 s, and 1.78 s one
+by one (`small`, idle)."""
 
 EDGE = 0.7
 """Difference between neighbouring pixels, in colour or opacity, from which on more rays are cast through both. Lowering
 it to 0.35 gains next to nothing more; 0.9 gains half as much."""
 
 EDGE_SUBPIXELS = ((0.0, 0.0), (-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
-"""Places in such a pixel, from its centre: that and a rotated grid of four."""
+"""Offsets of rays from the centre of such a pixel: the centre and a rotated grid of four."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Pictures:
     """Rendered views.
 
     Attributes:
-        images: RGB over the background, white unless told otherwise.
-        opacity: how much of each pixel is covered, in [0, 1].
-        depth: expected distance along the ray in world units, not the z coordinate in the camera; 0 where the ray hits
+        images: RGB over the background, by default white.
+        opacity: of each pixel, in [0, 1].
+        depth: expected distance along the ray in world units, not the z coordinate in the camera; 0 if the ray hits
             nothing.
         samples: number of field evaluations, over all pixels.
     """
@@ -54,7 +54,7 @@ class Pictures:
 
 
 def join_pictures(parts: Sequence[Pictures]) -> Pictures:
-    """The views of several pictures, one after the other.
+    """Several pictures concatenated.
 
     Args:
         parts: at least one, of one image size.
@@ -78,21 +78,21 @@ def render_images(
     antialias: bool = False,
     edge: float = EDGE,
 ) -> Pictures:
-    """The images of cameras, by a function that renders rays.
+    """The pictures of cameras, by a function that renders rays.
 
     Rays are cast in the precision of the cameras and rendered in single precision. A pixel of a photograph is the mean
-    of what its area shows, and one ray shows its centre alone. With `antialias` pixels that differ much from one beside
-    them are the mean of five rays (docs/image-based.md, "Edges").
+    over its area, but one ray samples only its centre. With `antialias`, pixels that differ much from a neighbour are
+    the mean of five rays (docs/image-based.md, "Edges").
 
     Args:
         cameras: any number, one image size.
-        bounds: what near and far of the rays are taken from.
-        render_rays: the pixels of rays.
+        bounds: sphere for near and far of the rays.
+        render_rays: makes the pixels of rays.
         occupancy: pixels whose rays miss every occupied voxel are background, and no ray is rendered for them.
         near_far: as in `geometry.cast`.
         background: grey value of those pixels.
-        antialias: five rays where pixels differ; the depth stays that of the centre.
-        edge: by how much they differ there.
+        antialias: cast five rays through pixels at edges; the depth stays that of the centre.
+        edge: difference from a neighbour from which on a pixel is at an edge.
 
     Returns:
         One picture a camera.
@@ -101,7 +101,7 @@ def render_images(
     needed = height * width * (BYTES_OF_VIEW + BYTES_KEPT * cameras.batch_size)
     require_memory("cameras", f"{cameras.batch_size} of {width}x{height}", needed, "render fewer or smaller pictures")
     pixels = pixel_grid(height, width, cameras.intrinsics.device)
-    # pixels whose rays may meet something; the others are background
+    # pixels whose rays may meet an occupied voxel; the others are background
     if occupancy is None:
         live = torch.ones(cameras.batch_size, height * width, dtype=torch.bool, device=pixels.device)
     else:
@@ -139,7 +139,7 @@ def render_images(
 
 
 def _groups(rays: Sequence[int]) -> list[int]:
-    """Where groups of successive views begin and end, of as many views as have RAYS_OF_GROUP rays, or of one.
+    """Boundaries of groups of successive views with at most RAYS_OF_GROUP rays, or of single views.
 
     >>> _groups([9000, 7000, 1000, 40000, 5000])
     [0, 2, 3, 4, 5]
@@ -156,7 +156,7 @@ def _groups(rays: Sequence[int]) -> list[int]:
 def pixels_at_edges(
     values: Float[Tensor, "view height width value"], least: float
 ) -> Bool[Tensor, "view height width"]:
-    """The pixels one of whose values differs that much from the value of the pixel beside, above or below.
+    """The pixels with a value that differs by at least `least` from that of a horizontal or vertical neighbour.
 
     Args:
         values: of pictures.

@@ -1,4 +1,4 @@
-"""Samples of a scene made into pixels: all at once, for gradients, or front to back until rays are opaque."""
+"""From samples of a scene to pixels: all at once, for gradients, or front to back until rays are opaque."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ from hyperplanes.rendering.scene import (
 
 __all__ = ["integrate"]
 
-FIRST_ROUND = 2  # samples a ray before the first test for opaque rays
-EXACT = 0.01  # `stop` up to which every sample of a ray is evaluated, not every second one first
-BESIDE = 0.03  # optical depth of a sample from which on those beside it are evaluated, on rays that are not opaque
-JUMP = 1.0  # of the optical depth from one sample to the next from which on the one between them is evaluated
-MIN_SHARE = 0.1  # of the largest weight of a pixel: samples from which on their colours are evaluated
-MIN_OPACITY = 1 / 64  # of a pixel whose colour is
-GROWTH = 2  # every later round takes one of so many of the samples so far, and at least as many as the first
-FIRST_REACH = 4  # samples a ray whose densities are evaluated first to draw those that have a gradient
-UNSEEN = 1 / 512  # `stop` up to which a ray that is stopped keeps its rest of background, half a grey level of 8 bits
-DIFFERENTIATED = 0.01  # weight of a sample from which on it always has its gradient, below in proportion to it
+FIRST_ROUND = 2  # samples per ray before the first test for opaque rays
+EXACT = 0.01  # `stop` up to which every sample of a ray is evaluated, instead of every second one first
+BESIDE = 0.03  # optical depth of a sample from which on its neighbours are evaluated, on rays that are not opaque
+JUMP = 1.0  # increase of optical depth to the next sample from which on the one between is evaluated
+MIN_SHARE = 0.1  # least weight of samples whose colours are evaluated, as a fraction of the largest on the ray
+MIN_OPACITY = 1 / 64  # least opacity of pixels whose colours are evaluated
+GROWTH = 2  # each later round takes the number of samples so far divided by this, and at least FIRST_ROUND
+FIRST_REACH = 4  # samples per ray in the first round of densities, from which samples with gradients are drawn
+UNSEEN = 1 / 512  # `stop` up to which a stopped ray keeps its share of background: half of an 8-bit grey level
+DIFFERENTIATED = 0.01  # weight of a sample from which on it always has a gradient; below, with proportional probability
 
 
 def integrate(
     scene: Scene, rays: Rays, sampler: Sampler, generator: torch.Generator | None, differentiable: bool
 ) -> Rendered:
-    """The pixels of rays, all in one pass.
+    """The pixels of rays, in one pass.
 
     Args:
         scene: what is rendered.
         rays: with near and far.
         sampler: places the samples.
         generator: jitters them, and draws which packed samples have a gradient (`_by_importance`).
-        differentiable: packed samples are evaluated for gradients: all at once, or where samples are random, those that
-            matter; otherwise front to back.
+        differentiable: whether packed samples are evaluated with gradients: all of them or, if they are random, those
+            that matter; otherwise front to back.
 
     Returns:
-        The pixels, of the field and of its coarse pass where there is one.
+        The pixels, of the field and of its coarse pass if there is one.
     """
     samples = sampler.place(rays, scene.occupancy, generator)
     if isinstance(samples, DenseSamples):
@@ -73,7 +73,7 @@ def _coarse_to_fine(
     generator: torch.Generator | None,
     differentiable: bool,
 ) -> Rendered:
-    """The first samples by the proposal; then, where the sampler refines them by their weights, those by the field."""
+    """The first samples with the proposal; if the sampler refines these by their weights, then the field."""
 
     def composited(function: FieldFunction, samples: DenseSamples) -> tuple[Rendered, Tensor]:
         points = rays.at(samples.distances)
@@ -94,9 +94,9 @@ def _coarse_to_fine(
 
 
 def _all_at_once(scene: Scene, rays: Rays, samples: PackedSamples) -> Rendered:
-    """Every sample with its gradient. The proposal, where there is one, is evaluated at every second sample of a ray.
+    """Every sample with its gradient. The proposal, if there is one, is evaluated at every second sample of a ray.
 
-    Each of those stands for the next one too, where there is one, so that both integrate over the same length.
+    Each of those also stands for the next one, if there is one, so that both integrate over the same length.
     """
 
     def composited(function: FieldFunction, chosen: PackedSamples, lengths: Tensor | float) -> Rendered:
@@ -126,7 +126,7 @@ def _at_surface(field: SplitField, rays: Rays, samples: OpaqueSamples, backgroun
 
 
 def _has_importance(scene: Scene, samples: PackedSamples) -> bool:
-    """Whether a gradient is wanted whose samples can be chosen by their densities."""
+    """Whether gradients are computed and their samples can be chosen by density."""
     if scene.proposal is not None or not isinstance(scene.field, SplitField) or not len(samples):
         return False
     return torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active()
@@ -135,35 +135,35 @@ def _has_importance(scene: Scene, samples: PackedSamples) -> bool:
 def _by_importance(
     scene: Scene, rays: Rays, samples: PackedSamples, stop: float, generator: torch.Generator
 ) -> Rendered:
-    """The pixels of all samples, and an estimate of their gradient from those that matter.
+    """The pixels of all samples, with a gradient estimated from the samples that matter.
 
-    Densities are evaluated without gradients, and not at all behind what leaves less than `stop` of the light. The
-    gradients that go through a sample are about proportional to its weight w, since those of softplus are to a small
-    density. So it is differentiated with probability p = min(1, w / DIFFERENTIATED), and what goes through it is
-    multiplied by 1 / p (importance sampling): a quarter of the samples of a car. The others keep their weights, and the
-    mean colour of the ray stands for theirs, 1 % of the pixel.
+    Densities are evaluated without gradients, and only as long as the transmittance is at least `stop`. The gradient
+    through a sample is about proportional to its weight w, since that of softplus is proportional to a small density.
+    So a sample is differentiated with probability p = min(1, w / DIFFERENTIATED), and its gradient is multiplied by
+    1 / p (importance sampling): a quarter of the samples of a car. The others keep their weights, with the mean colour
+    of the ray as colour, 1 % of the pixel.
 
-    The weights of all samples make the estimate unbiased but for those colours: the mean gradient differs by 0.05 to
-    1 % from that with the colours of all samples (fields of `small` of three objects, before and after 100 steps), and
-    by 7 % where weights are random and all is haze. With the colours of all samples 100 steps end 0.03 ± 0.02 dB
-    higher (16 objects, 25 views, two seeds), in more time.
+    With the weights of all samples the estimate is unbiased, except for those colours: the mean gradient differs by
+    0.05 to 1 % from that with the colours of all samples (fields of `small` of three objects, before and after 100
+    steps), and by 7 % for random weights, where all is haze. With the colours of all samples 100 steps end 0.03 ± 0.02
+    dB higher (16 objects, 25 views, two seeds) and take longer.
     """
     field, count = scene.field, len(rays)
     assert isinstance(field, SplitField)
     with torch.no_grad():
         density, reached = _densities(field, rays, samples, stop)
         samples, density = samples[reached], density[reached]
-        # those that are differentiated, and how likely that was
+        # samples that are differentiated, and their probabilities
         weights = packed_weights(density * samples.step, samples.ray, count)
         likely = (weights / DIFFERENTIATED).clamp_max(1)
         drawn = torch.rand(len(likely), generator=generator, dtype=likely.dtype).to(likely.device) < likely
         chosen = drawn.nonzero()[:, 0]
         factor = 1 / likely[chosen]
-    # their colours and densities, whose gradients are scaled; all other densities as they are
+    # their colours and densities with scaled gradients; all other densities unchanged
     colour, found = (each.to(density) for each in evaluate(field, *_packed_points(rays, samples[chosen])))
     colour, found = _scaled_gradient(colour, factor[:, None]), _scaled_gradient(found, factor)
     density = density.index_put((chosen,), found)
-    with torch.no_grad():  # the mean of the colours of each ray that are known, the background where none is
+    with torch.no_grad():  # the mean of the known colours of each ray, or the background if there are none
         known = torch.cat([colour, torch.ones_like(colour[:, :1])], 1) * weights[chosen, None]
         sums, share = known.new_zeros(count, 4).index_add(0, samples.ray[chosen], known).split([3, 1], 1)
         mean = torch.where(share > 0, sums / share.clamp_min(1e-12), scene.background)
@@ -174,7 +174,7 @@ def _by_importance(
 
 
 def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: float) -> tuple[Tensor, Tensor]:
-    """The densities of samples in front of what leaves less than `stop` of the light, and which samples these are."""
+    """Densities of the samples up to a transmittance of `stop`, and the indices of these samples."""
     if not _gain_by_rounds(rays):
         points, _ = _packed_points(rays, samples)
         found = torch.cat([field.density_of(each) for each in _in_batches(field.hidden, points)])
@@ -185,7 +185,7 @@ def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: floa
     remaining, reach = torch.arange(len(samples), device=rank.device), 0
     reached = torch.zeros(len(samples), dtype=torch.bool, device=rank.device)
     while len(remaining):
-        # twice as far in every round; rays that are opaque by then leave
+        # twice as far in each round; opaque rays are dropped
         reach += max(FIRST_REACH, reach)
         now = rank[remaining] < reach
         chosen, remaining = remaining[now], remaining[~now]
@@ -198,12 +198,12 @@ def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: floa
 
 
 def _gain_by_rounds(rays: Rays) -> bool:
-    """Whether fewer samples take less time, if they come in rounds; a GPU waits for each of these."""
+    """Whether rounds with fewer samples save time; a GPU has to synchronise after each."""
     return rays.origins.device.type == "cpu"
 
 
 def _scaled_gradient(value: Tensor, factor: Tensor) -> Tensor:
-    """The same numbers, whose gradients are multiplied by a factor."""
+    """The same values, with gradients multiplied by a factor."""
     return value.detach() + (value - value.detach()) * factor
 
 
@@ -215,10 +215,9 @@ def _ranks(ray: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float) -> Rendered:
-    """The pixels of what lies in front of where the transmittance of a ray falls below `stop` (early ray termination).
+    """The pixels of rays that end where their transmittance falls below `stop` (early ray termination).
 
-    Rays that are stopped are rendered as opaque where that can be seen: what lies behind has the colour of what is in
-    front.
+    If the difference is visible, stopped rays are rendered as opaque: the rest gets the colour of what is in front.
     """
     limit, count = -math.log(stop) if stop > 0 else math.inf, len(rays)
     split = scene.field if stop > 0 and isinstance(scene.field, SplitField) else None
@@ -240,19 +239,19 @@ def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float
 def _in_rounds(
     scene: Scene, rays: Rays, samples: PackedSamples, split: SplitField | None, limit: float, stride: int
 ) -> tuple[Tensor, Tensor, list[tuple[Tensor, Any]]]:
-    """Rounds of a few samples a ray; rays whose optical depth has reached a limit leave.
+    """Evaluates rounds of a few samples per ray; rays whose optical depth has reached a limit are dropped.
 
-    With a stride of 2 every second sample stands for the next one too. Then some of those between are evaluated: where
-    a surface begins at once, the one before it, and beside any density on the rays that are left. Four fifths of what
-    longer steps lose is lost in the few pixels that a ray leaves half transparent.
+    With a stride of 2, every second sample also stands for the next one. Afterwards some of those between are
+    evaluated: the one before an abrupt surface, and neighbours of any density on the rays that are left. Four fifths
+    of the error of longer steps are in the few pixels that stay half transparent.
 
     Returns:
-        Which samples were evaluated, in the order of all samples; the optical depth that each stands for; and the same
-        samples in batches, with their colours, or what a split field computes these from.
+        The indices of the evaluated samples, ascending; the optical depth that each stands for; and the same samples in
+        batches, with their colours, or the hidden values that a split field computes these from.
     """
     ray, found = samples.ray, []
     optical_depths = samples.distances.new_zeros(len(ray))  # of single steps
-    length = torch.zeros_like(ray)  # that each stands for, in steps
+    length = torch.zeros_like(ray)  # steps that each sample stands for
 
     def visit(chosen: Tensor, steps: Tensor | int) -> None:
         length[chosen] = steps
@@ -276,7 +275,7 @@ def _in_rounds(
     place, optical_depth, reach = first.clone(), optical_depths.new_zeros(len(rays)), 0
     remaining = (place < end).nonzero()[:, 0]
     while len(remaining):
-        # this round: the next samples of the rays left
+        # this round: the next samples of the remaining rays
         count = max(FIRST_ROUND, reach // GROWTH)
         reach += count
         index = place[remaining, None] + stride * torch.arange(count, device=ray.device)
@@ -287,7 +286,7 @@ def _in_rounds(
         remaining = remaining[(optical_depth < limit)[remaining] & (place < end)[remaining]]
     evaluated = torch.cat([remaining, *(index for index, _ in found)])
     if stride > 1:
-        # the samples on both sides of those with density; where it begins at once, the one before
+        # the neighbours of samples with density; before an abrupt surface, the one in front
         depths, previous = optical_depths * length, evaluated - stride
         begins = previous < first[ray[evaluated]]
         jump = depths[evaluated] - torch.where(begins, 0.0, depths[previous.clamp_min(0)])
@@ -311,9 +310,9 @@ def _colours(
     hidden: list[tuple[Tensor, Any]],
     background: float,
 ) -> Tensor:
-    """Colours of weighted samples, such that those of little weight have the mean of the others of their ray.
+    """Colours of weighted samples; those of little weight get the mean colour of the others on their ray.
 
-    `index` says which samples these are, and `hidden` holds what their colours are computed from.
+    `index` has the indices of the samples, and `hidden` the values that their colours are computed from.
     """
     ray, zeros = samples.ray[index], weights.new_zeros(len(rays))
     total, heaviest = zeros.index_add(0, ray, weights), zeros.scatter_reduce(0, ray, weights, "amax")
@@ -329,15 +328,15 @@ def _colours(
 
 
 def _joined(batches: Iterable[tuple[Tensor, Any]], wanted: Tensor) -> Generator[tuple[Tensor, Any]]:
-    """The wanted samples of batches in fewer ones: those of late rounds are so small that their number is what counts.
+    """The wanted samples of batches in fewer batches, since those of late rounds are small.
 
     Args:
-        batches: indices of samples, and what their colours are computed from.
-        wanted: of each sample, whether it is.
+        batches: indices of samples, and the values that their colours are computed from.
+        wanted: whether each sample is wanted.
 
     Yields:
-        Successive batches as one, of at most `points_per_batch` samples unless one has more. Values of a kind that
-        cannot be joined come as they are.
+        Successive batches as one, of at most `points_per_batch` samples unless one has more. Values that cannot be
+        joined stay as they are.
     """
     held: list[tuple[Tensor, Any]] = []
     most = points_per_batch(wanted.device)

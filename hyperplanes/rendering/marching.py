@@ -1,4 +1,4 @@
-"""Ray marching: samples at equal steps, packed over all rays, only where an occupancy grid is occupied."""
+"""Ray marching: samples at equal steps, packed over all rays, only in occupied voxels."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from hyperplanes.utilities.transforms import are_plain
 __all__ = ["RayMarching", "march"]
 
 CANDIDATES = 1 << 21  # samples tested against the grid at once; 12 bytes each
-RAYS = 512  # that one call of the kernel works on
-PIXELS, MOST_PIXELS = 100, 4.0  # across the scene for which 5 samples for 3 in training do; times that are followed
+RAYS = 512  # in one call of the kernel
+PIXELS, MOST_PIXELS = 100, 4.0  # across the scene for 5/3 of the samples of training; largest ratio to that number
 MOST_STEPS = 1 << 14
-STOP_FACTOR, HIGHEST_STOP = 4.0, 0.1  # of `stop` for pictures, where what lies behind has the colour in front
+STOP_FACTOR, HIGHEST_STOP = 4.0, 0.1  # of `stop` for pictures, in which stopped rays are opaque
 
 
 @checked_fields
 @dataclass(frozen=True)
 class RayMarching:
-    """The default sampler: equal steps, only in occupied voxels, and in images only until the ray is opaque.
+    """The default sampler: equal steps, only in occupied voxels, and in pictures only until the ray is opaque.
 
     Attributes:
         steps: samples along a diameter of the scene's sphere.
-        stop: transmittance below which a ray is finished, in [0, 1); 0 never stops. With gradients too on a CPU, where
-            samples are random; on a GPU all samples have theirs.
+        stop: transmittance below which a ray ends, in [0, 1); 0 never stops. With gradients rays end only on a CPU, if
+            samples are random.
 
     Raises:
-        ValueError: a `stop` out of its range.
+        ValueError: `stop` out of range.
     """
 
     steps: Annotated[int, range(1, MOST_STEPS + 1)] = 96
@@ -52,7 +52,7 @@ class RayMarching:
 
     @property
     def near_far(self) -> str:
-        """Near and far where the ray crosses the scene's sphere."""
+        """Near and far at the intersections with the scene's sphere."""
         return "sphere"
 
     @property
@@ -61,13 +61,13 @@ class RayMarching:
         return True
 
     def for_rendering(self, pixels: float) -> RayMarching:
-        """More samples than in training, where they are jittered; rays end sooner, and are opaque then.
+        """More samples than in training, where they are jittered; rays end sooner, and are then opaque.
 
-        They are 5 for 3 where 100 pixels show the whole scene, and grow with the square root of the pixels: a picture
-        of 400 would lose 0.2 dB with as many samples as one of 128.
+        There are 5/3 as many if the scene is 100 pixels across, and they grow with the square root of the pixels: a
+        picture of 400 pixels would lose 0.2 dB with as many samples as one of 128.
 
         Args:
-            pixels: that the diameter of the scene's sphere takes.
+            pixels: along the diameter of the scene's sphere.
         """
         finer = math.sqrt(min(max(pixels / PIXELS, 1 / MOST_PIXELS), MOST_PIXELS))
         stop = max(self.stop, min(HIGHEST_STOP, STOP_FACTOR * self.stop))
@@ -79,15 +79,15 @@ class RayMarching:
         return f"{self.steps} in hull"
 
     def rays_per_chunk(self, device: torch.device) -> int:
-        """So many that few chunks make an image and the packed samples fit into memory; on a CPU one thread's part."""
+        """So many that a picture has few chunks and packed samples fit into memory; on a CPU, the part of a thread."""
         return 1 << 12 if device.type == "cpu" else 1 << 16
 
     def place(self, rays: Rays, occupancy: Occupancy | None, generator: torch.Generator | None = None) -> PackedSamples:
-        """One sample a step where the grid is occupied.
+        """One sample per step in occupied voxels.
 
         Args:
             rays: with near and far.
-            occupancy: which voxels are sampled; its sphere gives the length of a step.
+            occupancy: the voxels that are sampled; its sphere determines the length of a step.
             generator: jitters the samples.
 
         Returns:
@@ -110,19 +110,19 @@ class RayMarching:
 
 @torch.no_grad()
 def march(rays: Rays, occupancy: Occupancy, step: float, generator: torch.Generator | None = None) -> PackedSamples:
-    """One sample every `step` along each ray, in the middle of the step, where the grid is occupied.
+    """One sample every `step` along each ray, in the middle of the step, in occupied voxels.
 
     Args:
-        rays: where near is not below far, there are no samples.
-        occupancy: which voxels are sampled.
+        rays: those with near >= far have no samples.
+        occupancy: the voxels that are sampled.
         step: distance between samples in world units.
-        generator: shifts each ray's samples by one random fraction of a step; on the CPU.
+        generator: shifts the samples of each ray by a random fraction of a step; on the CPU.
 
     Returns:
         The samples in occupied voxels.
 
     Raises:
-        ValueError: rays without an end, or no step, as of a sphere without a radius.
+        ValueError: near and far, or a step, that are not finite, or a step of 0, as for a sphere of radius 0.
     """
     longest = float((rays.far - rays.near).max()) if len(rays) else 0.0
     if not math.isfinite(longest):
@@ -138,7 +138,7 @@ def march(rays: Rays, occupancy: Occupancy, step: float, generator: torch.Genera
 
 
 def _has_kernel(rays: Rays) -> bool:
-    """Whether the kernel takes these rays."""
+    """Whether the kernel supports these rays."""
     kind = rays.near.dtype in (torch.float32, torch.float64) and rays.near.device.type == "cpu"
     return kind and bool(find_spec("numba")) and are_plain(rays.origins)
 
@@ -146,7 +146,7 @@ def _has_kernel(rays: Rays) -> bool:
 def _walk_compiled(
     rays: Rays, start: Tensor, occupancy: Occupancy, step: float, count: int
 ) -> tuple[Int[Tensor, " sample"], Float[Tensor, " sample"]]:
-    """The rays and the distances of samples, by the compiled kernel."""
+    """The ray indices and the distances of samples, by the compiled kernel."""
     origins, directions, first, far = (
         each.detach().contiguous().numpy() for each in (rays.origins, rays.directions, start, rays.far)
     )
@@ -172,7 +172,7 @@ def _walk_compiled(
 def _walk_torch(
     rays: Rays, start: Tensor, occupancy: Occupancy, step: float, count: int
 ) -> tuple[Int[Tensor, " sample"], Float[Tensor, " sample"]]:
-    """The rays and the distances of samples, in plain PyTorch."""
+    """The ray indices and the distances of samples, in PyTorch."""
     steps = torch.arange(count, dtype=start.dtype, device=start.device) * step
     rows, distances = [start.new_zeros(0, dtype=torch.long)], [start.new_zeros(0)]
     for first in range(0, len(rays), max(1, CANDIDATES // count)):

@@ -1,4 +1,4 @@
-"""Pruning of an occupancy grid: voxels whose density is negligible are dropped."""
+"""Pruning of an occupancy grid: voxels with negligible density are dropped."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["RefinedOccupancy", "refine"]
 
 CHUNK = 1 << 14  # voxels in one call of the density
 OPAQUE = 1.0  # optical depth of a voxel from which on it hides what lies behind it
-ALONG = 0.2  # of the longest part of a direction, from which on its other parts count
+ALONG = 0.2  # components of a direction below this fraction of the largest one are ignored
 COARSE_FIRST = 60_000  # occupied voxels from which on half the resolution is evaluated first
 
 
@@ -25,17 +25,17 @@ class RefinedOccupancy(Occupancy):
     """The voxels in which a field is not empty.
 
     Attributes:
-        optical_depth: of each voxel, by the density at its centre; infinite behind opaque ones, 0 where none was found.
+        optical_depth: of each voxel, from the density at its centre; infinite behind opaque voxels, 0 if not evaluated.
     """
 
     optical_depth: Float[Tensor, "x y z"]
 
     def solid(self, optical_depth: float = 0.03) -> Occupancy:
-        """The voxels that the field fills: the first of them along a ray is its surface.
+        """The voxels that the field fills; the first of them along a ray is its surface.
 
         Args:
-            optical_depth: of a voxel, from which on it counts. By less than 0.03 haze hides what lies behind it; by 0.3
-                surfaces that few views leave half transparent are lost (up to 2.9 dB with 5 views).
+            optical_depth: least optical depth of such a voxel. With less than 0.03 haze hides what lies behind it; with
+                0.3 surfaces that are half transparent, as with few views, are lost (up to 2.9 dB with 5 views).
         """
         return Occupancy(self.optical_depth > optical_depth, self.bounds)
 
@@ -51,34 +51,34 @@ def refine(
     """The voxels of a grid in which a field is not empty.
 
     The density is evaluated at the centre of every occupied voxel that does not lie behind opaque ones, then, in voxels
-    that are to be dropped, at the centres of their eighths, half a voxel apart. Voxels above the threshold are dilated
-    by one voxel, the margin, and never beyond the grid that was given. What is kept of an object with sharp borders:
+    that would be dropped, at the centres of their eight parts, half a voxel apart. Voxels above the threshold are
+    dilated by one voxel, the margin, but never beyond the given grid. Of an object with sharp borders, this keeps:
 
-    - in a grid of up to 60,000 occupied voxels, such as a visual hull: whatever is at least half a voxel thick;
-    - in a larger one (no masks, so no hull), which is evaluated at half its resolution first: what is two voxels thick,
-      and whatever is half a voxel thick and connected to that, which is followed from neighbour to neighbour.
+    - in a grid of up to 60,000 occupied voxels, such as a visual hull: everything at least half a voxel thick;
+    - in a larger one (without masks, so without a hull), which is first evaluated at half its resolution: everything
+      two voxels thick, and everything half a voxel thick that is connected to it, by following neighbours.
 
-    Thinner things may be missed, as samples on a ray may miss them.
+    Thinner parts may be missed, as samples on a ray may miss them.
 
-    The threshold is the density at which a ray across the whole sphere would be `opacity_loss` opaque, so haze in many
-    voxels counts as much as in one. On cars of 64 pixels a picture then differs from one without refinement by 68 dB
-    where there are no masks and 92 dB where there are, and by less than 0.01 dB against the truth.
+    The threshold is the density at which a ray through the whole sphere would have an opacity of `opacity_loss`, so
+    haze in many voxels counts as much as in one. On cars of 64 pixels, pictures with and without refinement have a PSNR
+    to each other of 68 dB without masks and 92 dB with masks, and differ by less than 0.01 dB against the truth.
 
     Args:
         occupancy: the voxels to evaluate, such as the visual hull.
         density: world points (point, 3) -> density per world unit (point,).
-        opacity_loss: upper bound of the opacity that a ray loses, if all dropped voxels lay along it.
-        margin_loss: `opacity_loss` of the margin, of which voxels are kept that reach its density where they are next
-            to the voxels that were found; absent, all of the margin is kept.
+        opacity_loss: upper bound of the opacity that a ray loses if all dropped voxels lie along it.
+        margin_loss: the same for the margin: its voxels are kept if they reach this density on the side towards the
+            voxels that were found; by default all are kept.
 
     Returns:
-        A grid of the same side and bounds.
+        A grid with the same side and bounds.
     """
     threshold = _density_of(opacity_loss, occupancy)
     least = threshold * occupancy.voxel  # optical depth
     side, bounds = occupancy.occupied.shape[0], occupancy.bounds
     asked, large = occupancy.occupied, side >= 64 and int(occupancy.occupied.sum()) > COARSE_FIRST
-    # of large grids only what a grid of half the resolution keeps is asked
+    # in large grids, only what a grid of half the resolution keeps is evaluated
     if large:
         halved = _halved(occupancy)
         coarse = _dilated(halved, _from_outside(halved, halved.occupied, density) > 2 * least)
@@ -88,7 +88,7 @@ def refine(
     optical_depth = _from_outside(occupancy, asked, density)
     filled = optical_depth > least
     kept, divided = _dilated(occupancy, filled), torch.zeros_like(filled)
-    # what lies between the centres: voxels beside those that are kept are asked in eight places
+    # between the centres: voxels beside those that are kept are evaluated at eight points
     while True:
         near = _dilated(occupancy, kept) if large else occupancy.occupied
         asked = near & occupancy.occupied & ~kept & ~divided
@@ -104,16 +104,16 @@ def refine(
 
 
 def _density_of(opacity_loss: float, occupancy: Occupancy) -> float:
-    """The density of which a diameter of the scene is so opaque."""
+    """The density with which a diameter of the scene has this opacity."""
     return -math.log1p(-opacity_loss) / (2 * occupancy.bounds.radius)
 
 
 def _trimmed(grid: Occupancy, filled: Tensor, density: Callable[[Tensor], Tensor], threshold: float) -> Tensor:
-    """The filled voxels of a grid, and those of the others that have density towards them.
+    """The filled voxels of a grid, and those of the others with density on the side towards them.
 
-    Each of the others is evaluated once, at the corner, or the middle of an edge or a face, that lies towards the
-    filled ones among its 26 neighbours: a flat surface that enters the voxel from there enters by that point. Where
-    there is no such point, as between two surfaces, it is kept.
+    Each of the others is evaluated once, at the corner, or the middle of an edge or face, that lies towards the filled
+    ones among its 26 neighbours: a flat surface that enters the voxel from there contains that point. If there is no
+    such point, as between two surfaces, the voxel is kept.
     """
     margin = Occupancy(grid.occupied & ~filled, grid.bounds)
     places, padded = margin.occupied.nonzero(), torch.nn.functional.pad(filled, (1,) * 6)
@@ -129,14 +129,14 @@ def _trimmed(grid: Occupancy, filled: Tensor, density: Callable[[Tensor], Tensor
 
 
 def _from_outside(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor]) -> Tensor:
-    """Optical depth of a voxel by the density at its centre; infinite where it lies behind opaque ones, 0 if not asked.
+    """Optical depth of voxels by the density at their centres; infinite behind opaque ones, 0 if not `asked`.
 
-    The density is evaluated from the surface inwards, as far as voxels are not opaque: three quarters of the hull of a
-    car lie behind, and no ray gets there.
+    The density is evaluated from the surface inwards until voxels are opaque: three quarters of the hull of a car lie
+    behind, where no ray gets.
     """
     result = torch.where(asked, torch.inf, 0.0)
     box, corner = _box_of(asked)  # an object fills a small part of its grid
-    left = torch.nn.functional.pad(asked[box], (1,) * 6)  # what lies beyond the box is outside
+    left = torch.nn.functional.pad(asked[box], (1,) * 6)  # beyond the box is outside
     steps = torch.tensor([left.shape[1] * left.shape[2], left.shape[2], 1], device=left.device)
     around = torch.cartesian_prod(*[torch.arange(-1, 2, device=left.device)] * 3) @ steps
     layer = (left & dilate(~left)).flatten().nonzero()[:, 0]
@@ -144,7 +144,7 @@ def _from_outside(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Te
     sides = torch.tensor(shape, device=left.device)
     depth = torch.where(left, torch.inf, 0.0)
     while len(layer):
-        places = layer[:, None] // steps % sides - 1 + corner  # torch.unravel_index takes 0.3 s to import sympy
+        places = layer[:, None] // steps % sides - 1 + corner  # torch.unravel_index imports sympy, which takes 0.3 s
         found = _densities(grid.centres_of(places), density) * grid.voxel
         depth[layer], left[layer] = found.to(depth), False
         beside = (layer[found < OPAQUE][:, None] + around).flatten()
@@ -164,7 +164,7 @@ def _densities(points: Tensor, density: Callable[[Tensor], Tensor]) -> Tensor:
 
 
 def _filled(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor], threshold: float) -> Tensor:
-    """Which of the asked voxels have density above a threshold at the centre of one of their eight equal parts."""
+    """The voxels of `asked` with density above a threshold at the centre of one of their eight parts."""
     points = Occupancy(asked, grid.bounds).centres()
     steps = torch.tensor([-0.25, 0.25], device=points.device) * grid.voxel
     offsets = torch.cartesian_prod(steps, steps, steps).reshape(-1, 3)
@@ -179,7 +179,7 @@ def _filled(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor],
 
 
 def _dilated(grid: Occupancy, filled: Tensor) -> Tensor:
-    """Filled voxels and those beside them, within the grid."""
+    """Filled voxels and their neighbours, inside the grid."""
     box, _ = _box_of(filled)
     box = tuple(slice(max(0, each.start - 1), each.stop + 1) for each in box)
     result = torch.zeros_like(filled)

@@ -1,4 +1,4 @@
-"""A field and rays, or cameras, make pixels. The field is any callable (points, directions) -> (colour, density)."""
+"""Renders rays or cameras of a field, which is any callable (points, directions) -> (colour, density)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from hyperplanes.utilities.arguments import checked
 
 __all__ = ["FieldFunction", "Hierarchical", "RayMarching", "Sampler", "allow_tf32", "render"]
 
-FEW = 16  # a chunk's part: fewer rays are not worth a second thread
+FEW = 16  # a chunk is divided by this for the least number of rays that is worth a second thread
 
 
 class _Options(TypedDict, total=False):
@@ -74,30 +74,29 @@ def render(
         field: any callable: world points (n, 3) and unit viewing directions (n, 3) -> colours (n, 3) in [0, 1] and
             densities (n,) per world unit.
         target: Kornia cameras of one image size, or rays.
-        sampling: where along the rays the field is evaluated. Where absent, `RayMarching` with the samples of images
-            for cameras; for rays `RayMarching` if there are bounds or an occupancy, else `Hierarchical`, which needs
+        sampling: where along the rays the field is evaluated. The default for cameras is `RayMarching` with samples for
+            pictures; for rays it is `RayMarching` with bounds or an occupancy, otherwise `Hierarchical`, which needs
             neither.
-        bounds: the sphere of the scene. Cameras see what lies in it; rays have their own near and far, and between them
-            `RayMarching` takes samples in the cube around the sphere. That of the occupancy where absent, and for
-            cameras the unit sphere where there is none.
-        occupancy: voxels where the field can be anything but empty, for `RayMarching`; all within the bounds where
-            absent.
-        proposal: the field of the coarse pass of `Hierarchical`; `field` where absent. `RayMarching` evaluates it only
+        bounds: the sphere of the scene. Cameras see what lies in it; rays have their own near and far, between which
+            `RayMarching` takes samples in the cube around the sphere. By default that of the occupancy or, for cameras
+            without one, the unit sphere.
+        occupancy: voxels outside of which the field is empty, for `RayMarching`; by default all within the bounds.
+        proposal: the field of the coarse pass of `Hierarchical`; by default `field`. `RayMarching` evaluates it only
             for gradients, so that it learns.
-        generator: jitters the samples; on the CPU. Without one they are the same each time. Where gradients are kept,
-            `RayMarching` with a `stop` above 0 also draws by it which samples have one. Such gradients are estimates,
-            right in the mean; second derivatives of them are not.
+        generator: jitters the samples; on the CPU. Without one, they are the same each time. With gradients,
+            `RayMarching` with `stop` above 0 also uses it to draw the samples that have gradients. Such gradients are
+            unbiased estimates; second derivatives of them are not.
         background: grey value behind everything.
-        differentiable: keep gradients to whatever the field and the rays depend on; by default for rays, not for
-            cameras. Without gradients rays are rendered in chunks, so that memory does not grow with their number, and
-            `RayMarching` stops where they are opaque.
-        chunk: rays at once where no gradient is kept; as many as suit the sampler and the device where absent.
-        antialias: for cameras, five rays through each pixel that differs much from a neighbour; where absent, by
-            `RayMarching` without gradients. The paper's protocol is one ray a pixel.
+        differentiable: whether to keep gradients with respect to whatever the field and the rays depend on; by default
+            for rays, but not for cameras. Without gradients, rays are rendered in chunks, so that memory does not grow
+            with their number, and `RayMarching` ends rays where they are opaque.
+        chunk: rays rendered at once without gradients; the default suits the sampler and the device.
+        antialias: for cameras, five rays through each pixel that differs much from a neighbour; by default for
+            `RayMarching` without gradients. The paper's protocol is one ray per pixel.
 
     Returns:
-        Pictures of cameras, pixels of rays. `RayMarching` for rays without occupancy and bounds, and fields with values
-        of another shape, raise ValueError.
+        Pictures of cameras, or pixels of rays. Raises ValueError for rays with `RayMarching` but without occupancy and
+        bounds, and for fields with values of another shape.
 
     >>> from hyperplanes.geometry.cameras import look_at, pinhole, symmetric_intrinsics
     >>> camera = pinhole(symmetric_intrinsics(5, 5, 0.7), look_at(torch.tensor([[0.0, 0.0, 3.0]])), 5, 5)
@@ -137,7 +136,7 @@ def render(
 def _in_chunks(
     scene: Scene, rays: Rays, sampler: Sampler, generator: torch.Generator | None, chunk: int | None
 ) -> Rendered:
-    """The pixels of rays without gradients, so many at once."""
+    """The pixels of rays without gradients, in chunks."""
     size = chunk or sampler.rays_per_chunk(rays.origins.device)
     with allow_tf32(rays.origins.device):
         on_cpu = rays.origins.device.type == "cpu"
@@ -148,7 +147,7 @@ def _in_chunks(
 
 
 def _bounds(total: int, size: int, even: bool = True) -> list[int]:
-    """Where parts of at most so many begin and end: equal ones, `even` in number for two threads.
+    """Boundaries of equal parts of at most `size`, `even` in number for two threads.
 
     >>> _bounds(10, 4), _bounds(2, 64), _bounds(0, 4)
     ([0, 3, 5, 8, 10], [0, 2], [0, 0])
@@ -159,7 +158,7 @@ def _bounds(total: int, size: int, even: bool = True) -> list[int]:
 
 
 def _joined(parts: list[Rendered]) -> Rendered:
-    """The pixels of all parts, one after the other."""
+    """Concatenates pixels."""
     coarse = [each.coarse for each in parts if each.coarse is not None]
     return Rendered(
         torch.cat([each.colour for each in parts]),
@@ -172,10 +171,10 @@ def _joined(parts: list[Rendered]) -> Rendered:
 
 @contextmanager
 def allow_tf32(device: torch.device) -> Generator[None]:
-    """On a GPU, single-precision matrix products in TF32 (10 bits of fraction, tensor cores) while the context lasts.
+    """On a GPU, float32 matrix products in TF32 (10 bits of mantissa, tensor cores) while the context lasts.
 
-    Pictures of the paper's networks are within 0.001 dB of those of full single precision. PyTorch's setting is that of
-    the process: of several contexts at a time, the last one to end puts back what was set before the first.
+    Pictures of the paper's networks are within 0.001 dB of those in full single precision. The setting of PyTorch is
+    for the whole process: of several contexts, the last one to end restores the setting before the first.
     """
     if device.type != "cuda":
         yield
@@ -196,6 +195,6 @@ def allow_tf32(device: torch.device) -> Generator[None]:
 
 
 _precisions: list[str] = []
-"""What was set before the first of the contexts of `allow_tf32`, once for each that lasts."""
+"""The setting before the first active context of `allow_tf32`, once for each active context."""
 
 _counting = Lock()

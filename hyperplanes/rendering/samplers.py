@@ -1,4 +1,4 @@
-"""Samplers: where along rays a field is evaluated. They place samples and know no field; the renderer composites.
+"""Samplers: where along rays a field is evaluated. They are independent of the field; the renderer composites.
 
 Samples come in two layouts, `DenseSamples` (the same number on every ray) and `PackedSamples` (any number on each).
 """
@@ -20,7 +20,7 @@ __all__ = ["DenseSamples", "OpaqueSamples", "PackedSamples", "Sampler"]
 
 @dataclass(frozen=True)
 class DenseSamples:
-    """Equally many samples on every ray.
+    """The same number of samples on every ray.
 
     Attributes:
         distances: of the samples along their rays, ascending.
@@ -38,7 +38,7 @@ class PackedSamples:
     Attributes:
         ray: index of the ray of each sample, ascending.
         distances: of the samples along their rays.
-        step: length of the interval that each stands for, in world units.
+        step: length of the interval that each sample stands for, in world units.
     """
 
     ray: Int[Tensor, " sample"]
@@ -53,12 +53,12 @@ class PackedSamples:
 
 
 class OpaqueSamples(PackedSamples):
-    """Samples that hide all that lies behind them, at most one a ray: their densities need not be evaluated."""
+    """Samples that hide everything behind them, at most one per ray; their densities need not be evaluated."""
 
 
 @runtime_checkable
 class Sampler(Protocol):
-    """A sampling scheme with all that training and rendering need to know about it."""
+    """A sampling scheme, for training and rendering."""
 
     @property
     def near_far(self) -> str:
@@ -67,38 +67,38 @@ class Sampler(Protocol):
 
     @property
     def needs_occupancy(self) -> bool:
-        """Whether samples are placed by an occupancy grid."""
+        """Whether samples are placed with an occupancy grid."""
         ...
 
     @property
     def stop(self) -> float:
-        """Transmittance below which a ray of packed samples is finished; 0 never stops.
+        """Transmittance below which a ray of packed samples ends; 0 never stops.
 
-        With gradients rays end there on a CPU alone, where samples are random.
+        With gradients, rays end only on a CPU, and only if samples are random.
         """
         ...
 
     def for_rendering(self, pixels: float) -> Sampler:
-        """The sampler for images of a field that was trained with this one; so many pixels cross the scene's sphere."""
+        """The sampler for pictures of a field that was trained with this one; the scene's sphere is `pixels` across."""
         ...
 
     @property
     def summary(self) -> str:
-        """Its samples, for tables."""
+        """The samples in short, for tables."""
         ...
 
     def rays_per_chunk(self, device: torch.device) -> int:
-        """How many rays are rendered at once where no gradient is wanted."""
+        """Number of rays that are rendered at once without gradients."""
         ...
 
     def place(
         self, rays: Rays, occupancy: Occupancy | None, generator: torch.Generator | None
     ) -> DenseSamples | PackedSamples:
-        """The first samples of rays with near and far; a generator jitters them."""
+        """The first samples of rays; a generator jitters them."""
         ...
 
     def refine(
         self, rays: Rays, samples: DenseSamples, weights: Tensor, generator: torch.Generator | None
     ) -> DenseSamples | None:
-        """Samples in place of dense ones whose compositing weights are known; None where those are final."""
+        """Samples that replace dense ones, given the weights of these; None if these are final."""
         ...

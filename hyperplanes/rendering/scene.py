@@ -1,4 +1,4 @@
-"""What is rendered: a field, the space it may fill, the field of a coarse pass, and what stands behind."""
+"""What is rendered: a field, its occupancy, the field of a coarse pass, and the background."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ __all__ = [
 FieldFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Points (n, 3) and unit directions (n, 3) -> colours (n, 3) in [0, 1] and densities (n,) per world unit.
 
-One with an attribute `thread_safe` that is true is evaluated by several threads at once where no gradient is kept."""
+If it has an attribute `thread_safe` that is true, several threads evaluate it at once when no gradients are kept."""
 
 
 @runtime_checkable
 class SplitField(Protocol):
-    """A field whose colours can be asked for later than its densities, at some of the points.
+    """A field whose colours can be evaluated after its densities, at some of the points.
 
-    In training its densities are asked for without gradients first, to choose the samples that get one: what a field
-    keeps from call to call, such as features of its views, is to be computed under `torch.enable_grad()`.
+    In training, densities are first evaluated without gradients, to choose the samples that get one: anything that a
+    field caches between calls, such as features of its views, must be computed under `torch.enable_grad()`.
     """
 
     def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Both at once, as any field."""
+        """Colours and densities, as of any field."""
         ...
 
     def hidden(self, points: Tensor) -> Any:
-        """What densities and colours of points (n, 3) are computed from.
+        """The values from which densities and colours of points (n, 3) are computed.
 
-        It can be indexed like a tensor. What is a tensor of as many rows, or a dataclass of such tensors, is joined
-        from several calls before colours are asked for.
+        They can be indexed like a tensor. A tensor of n rows, or a dataclass of such tensors, is concatenated over
+        several calls before colours are evaluated.
         """
         ...
 
@@ -54,7 +54,7 @@ class SplitField(Protocol):
         ...
 
     def colour_of(self, hidden: Any, directions: Tensor) -> Tensor:
-        """Colours (n, 3) in [0, 1] seen along unit directions (n, 3)."""
+        """Colours (n, 3) in [0, 1], seen along unit directions (n, 3)."""
         ...
 
 
@@ -64,13 +64,13 @@ def mapped(
     directions: Callable[[Tensor], Tensor],
     values: Callable[[Tensor], Tensor] | None = None,
 ) -> FieldFunction:
-    """A field of other points: its colours can be asked for later where those of the given one can.
+    """A field with transformed points, directions and values; a `SplitField` if the given one is.
 
     Args:
         field: any callable.
-        points: those that it is asked for -> those of the given field.
-        directions: likewise.
-        values: of colours and densities; None leaves them as they are.
+        points: maps its points to those of the given field.
+        directions: maps directions likewise.
+        values: maps colours and densities back; None leaves them unchanged.
     """
     kind = _SplitMapped if isinstance(field, SplitField) else _Mapped
     return kind(field, points, directions, values)
@@ -102,7 +102,7 @@ class _Mapped:
 
 
 class _SplitMapped(_Mapped):
-    """Likewise, of one whose colours can be asked for later than its densities."""
+    """The same for a `SplitField`."""
 
     def hidden(self, points: Tensor) -> Any:
         return self.field.hidden(self.points(points))
@@ -120,8 +120,8 @@ class Scene:
 
     Attributes:
         field: any callable.
-        occupancy: voxels where the field can be anything but empty.
-        proposal: the field of the coarse pass, where it is another one.
+        occupancy: voxels outside of which the field is empty.
+        proposal: the field of the coarse pass, if it is another one.
         background: grey value behind everything.
     """
 
@@ -132,7 +132,7 @@ class Scene:
 
     @property
     def is_thread_safe(self) -> bool:
-        """Whether its fields say, by an attribute `thread_safe`, that several threads may call them at once."""
+        """Whether several threads may call its fields at once, by their attributes `thread_safe`."""
         fields = (self.field, self.proposal or self.field)
         return all(getattr(field, "thread_safe", False) for field in fields)
 
@@ -146,13 +146,13 @@ def evaluate(
         field: any callable.
         points: (n, 3) in the world.
         directions: (n, 3) unit vectors.
-        differentiable: all points in one call; otherwise in batches, which bounds the memory of activations.
+        differentiable: whether all points are evaluated in one call; otherwise in batches, to bound memory.
 
     Returns:
         Colours (n, 3) and densities (n,).
 
     Raises:
-        ValueError: no pair of tensors, values of another shape, or densities below 0.
+        ValueError: not a pair of tensors, values of another shape, or densities below 0.
     """
     size = len(points) if differentiable else points_per_batch(points.device)
     parts = [field(*part) for part in zip(points.split(max(1, size)), directions.split(max(1, size)), strict=True)]
@@ -168,20 +168,20 @@ def evaluate(
     if _is_negative(density):
         raise ValueError(
             f"field: expected densities of 0 or more, got {float(density.detach().min()):.3g}; "
-            "torch.nn.functional.softplus or relu makes them so"
+            "apply torch.nn.functional.softplus or relu"
         )
     return colour, density
 
 
 def _is_negative(density: Tensor) -> bool:
-    """Whether a density is below 0; values cannot be looked at under `torch.compile` and `torch.func`."""
+    """Whether a density is below 0; False under `torch.compile` and `torch.func`, where values are not known."""
     if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
         return False
     return bool((density.detach() < 0).any())
 
 
 def can_be_joined(hidden: Any) -> bool:
-    """Whether `join_hidden` takes what a `SplitField` computes densities and colours from.
+    """Whether `join_hidden` supports the hidden values of a `SplitField`.
 
     Args:
         hidden: of a batch of points.
@@ -193,7 +193,7 @@ def can_be_joined(hidden: Any) -> bool:
 
 
 def join_hidden(parts: Sequence[Any]) -> Any:
-    """What a `SplitField` computes densities and colours from, of several batches of points as one (`can_be_joined`).
+    """Concatenates the hidden values of a `SplitField` for several batches of points (`can_be_joined`).
 
     Args:
         parts: at least one.
@@ -207,10 +207,10 @@ def join_hidden(parts: Sequence[Any]) -> Any:
 
 
 def points_per_batch(device: torch.device) -> int:
-    """How many points a field is evaluated at in one call where no gradient is kept.
+    """Number of points at which a field is evaluated in one call without gradients.
 
-    On a CPU a few megabytes of activations, which stay in its cache; on a GPU a twentieth of its free memory, at about
-    8 KiB a point.
+    On a CPU, for a few megabytes of activations, which stay in its cache; on a GPU, for a twentieth of its free memory,
+    at about 8 KiB per point.
     """
     if device.type == "cpu":
         return 1 << 13

@@ -1,7 +1,7 @@
-"""A differentiable rasteriser of Gaussians, as viewers of Gaussian splats draw them, compiled for the CPU by numba.
+"""A differentiable rasteriser of Gaussian splats, compiled for the CPU with numba.
 
 As in "3D Gaussian Splatting" (Kerbl et al., 2023): Gaussians are projected by the local affine approximation of the
-perspective, widened by 0.3 square pixels, and composited front to back in the order of their depths.
+perspective, dilated by 0.3 square pixels, and composited front to back, sorted by depth.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from hyperplanes.geometry.kernels.compiling import compile_function
 __all__ = ["render_splats", "rotations_of"]
 
 DILATION = 0.3  # square pixels
-NEAR = 1e-6  # of the scene's unit: what lies nearer to the camera's plane is not drawn
+NEAR = 1e-6  # least depth of Gaussians that are drawn, in world units
 LARGEST_ALPHA, SMALLEST_ALPHA = 0.99, 1 / 255
-DEVIATIONS = 3.0  # from the centre of a splat to the border of what is drawn of it
+DEVIATIONS = 3.0  # extent of a splat from its centre, in standard deviations
 
 
 def rotations_of(quaternions: Float[Tensor, "splat 4"]) -> Float[Tensor, "splat 3 3"]:
@@ -48,7 +48,7 @@ def render_splats(
     colours: Float[Tensor, "splat 3"],
     cameras: PinholeCamera,
 ) -> Float[Tensor, "3 height width"]:
-    """The picture of Gaussians over white for one camera, with gradients to all that describes them.
+    """The picture of Gaussians over white for one camera, differentiable in all parameters of the Gaussians.
 
     Args:
         means: in the world.
@@ -86,7 +86,7 @@ def render_splats(
 
 
 class _Rasterise(torch.autograd.Function):
-    """Splats in the order of their depths to a picture (height, width, 3)."""
+    """From splats sorted by depth to a picture (height, width, 3)."""
 
     @staticmethod
     def forward(
@@ -108,7 +108,7 @@ class _Rasterise(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         centres, conics, reach, opacities, colours, left = ctx.saved_tensors
         wrong = gradients[0].float().contiguous()
-        behind = (left * wrong.sum(-1)).contiguous()  # what lies behind, white at last, times the gradient
+        behind = (left * wrong.sum(-1)).contiguous()  # the colour behind, in the end white, times the gradient
         found = [torch.zeros_like(part) for part in (centres, conics, opacities, colours)]
         arrays = (centres, conics, reach, opacities, colours, wrong, left.clone(), behind, *found)
         compile_function(_backward)(*(part.numpy() for part in arrays))

@@ -1,4 +1,4 @@
-"""Transmittance inside a grid of voxels: ray marching compiled by numba, on the CPU."""
+"""Transmittance inside a grid of voxels: ray marching on the CPU, compiled with numba."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 
 __all__ = ["transmittance"]
 
-CELLS = 1 << 12  # that are processed together
+CELLS = 1 << 12  # processed together
 MAX_OPTICAL_DEPTH = 12.0  # beyond it the transmittance is zero in single precision
 
 
@@ -23,8 +23,8 @@ def transmittance(
 ) -> Float[Tensor, "cell direction"]:
     """Transmittance from outside the grid to the centres of voxels, along each direction.
 
-    The ray is marched backwards from the voxel's centre in steps of one voxel, the first of which leaves the voxel
-    itself; every step adds the optical depth of the voxel that it ends in.
+    Each ray is marched backwards from the centre of its voxel in steps of one voxel; every step adds the optical depth
+    of the voxel that it ends in, so the voxel itself is not counted.
 
     Args:
         optical_depth: density of each voxel times its side.
@@ -49,7 +49,7 @@ def _transmittance(optical_depth, cells, directions, found, start, stop):
             x, y, z = directions[direction, 0], directions[direction, 1], directions[direction, 2]
             total, step = 0.0, 1.0
             while total < MAX_OPTICAL_DEPTH:
-                # The voxel that holds the next point of the ray; the ray ends where there is none.
+                # the voxel of the next point on the ray; outside the grid the ray ends
                 at_x = int(math.floor(cells[cell, 0] + 0.5 - step * x))
                 at_y = int(math.floor(cells[cell, 1] + 0.5 - step * y))
                 at_z = int(math.floor(cells[cell, 2] + 0.5 - step * z))

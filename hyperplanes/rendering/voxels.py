@@ -1,4 +1,4 @@
-"""A ray caster for sparse voxel grids, compiled for the CPU, and the gradient of what it renders."""
+"""A differentiable ray caster for sparse voxel grids, compiled for the CPU."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from hyperplanes.rendering.compositing import Rendered
 __all__ = ["STOP", "VoxelGrid", "distance_to_filled", "render_voxels", "shade_voxels", "voxel_gradients"]
 
 MAX_DISTANCE = 255  # of the distance transform, which is stored in a byte
-STOP = 1e-3  # transmittance below which a ray is finished
+STOP = 1e-3  # transmittance below which a ray ends
 RAYS, ROWS = 1 << 10, 1 << 14  # in one call of the kernels
 
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """The box of a sparse voxel grid that holds its voxels, as rays are cast through it.
+    """The bounding box of the voxels of a sparse grid, for ray casting.
 
     Cell (i, j, k) lies between the centres of voxels (i, j, k) and (i + 1, j + 1, k + 1).
 
     Attributes:
-        rows: row of every voxel, or -1; the outermost voxels have none.
-        distances: chessboard distance from every cell to the nearest one that is not empty.
+        rows: row of each voxel, or -1; the outermost voxels have none.
+        distances: chessboard distance from each cell to the nearest non-empty one.
         first: world position of the centre of voxel (0, 0, 0).
         voxel: side of a voxel in world units.
     """
@@ -46,10 +46,10 @@ class VoxelGrid:
 
     @classmethod
     def of(cls, index: Int[Tensor, "x y z"], bounds: Sphere) -> VoxelGrid:
-        """The box of these voxels.
+        """The bounding box of these voxels.
 
         Args:
-            index: row of every voxel of a cube, or -1.
+            index: row of each voxel of a cube, or -1.
             bounds: the sphere inside the cube.
         """
         low, high = zip(*((first, last or 1) for first, last in ranges(index >= 0)), strict=True)
@@ -60,13 +60,13 @@ class VoxelGrid:
 
 
 def distance_to_filled(index: Int[Tensor, "x y z"]) -> UInt8[Tensor, "cell_x cell_y cell_z"]:
-    """Chessboard distance from every cell to the nearest one that is not empty, for empty-space skipping.
+    """Chessboard distance from each cell to the nearest non-empty one, for empty-space skipping.
 
-    Cell (i, j, k) lies between the centres of voxels i - 1 and i, and so on; there is one more of them an axis than
-    voxels. It is empty where none of its eight voxels has a row.
+    Cell (i, j, k) lies between the centres of voxels i - 1 and i, and so on; there is one more cell than voxels along
+    each axis. It is empty if none of its eight voxels has a row.
 
     Args:
-        index: row of every voxel or -1.
+        index: row of each voxel, or -1.
 
     >>> distance_to_filled(torch.tensor([-1, -1, 0, -1, -1]).reshape(1, 1, 5))[0, 0].tolist()
     [2, 1, 0, 0, 1, 2]
@@ -86,13 +86,13 @@ def distance_to_filled(index: Int[Tensor, "x y z"]) -> UInt8[Tensor, "cell_x cel
 def shade_voxels(
     values: Float[Tensor, "row 28"], centres: Float[Tensor, "row 3"], eye: Float[Tensor, " 3"]
 ) -> Float[Tensor, "padded_row 4"]:
-    """Voxels as one camera sees them: density, and red, green and blue times density; zeros in a row after the last.
+    """Voxels as one camera sees them: density, and red, green and blue times density, followed by a row of zeros.
 
-    A picture then interpolates four numbers a voxel and not 28. The direction is that of the ray through the centre of
-    the voxel.
+    A picture then interpolates four numbers per voxel instead of 28. The direction is that of the ray through the
+    centre of the voxel.
 
     Args:
-        values: density and 3 x 9 coefficients of every row.
+        values: density and 3 x 9 coefficients of each row.
         centres: of the voxels, in world units.
         eye: the centre of the camera.
     """
@@ -106,17 +106,17 @@ def shade_voxels(
 def render_voxels(
     grid: VoxelGrid, shaded: Float[Tensor, "padded_row 4"], rays: Rays, *, step: float, stop: float = STOP
 ) -> Rendered:
-    """The pixels of rays through a baked field: the same sums as `RayMarching` computes, in one compiled loop a ray.
+    """The pixels of rays through a baked field: the same sums as for `RayMarching`, in a compiled loop per ray.
 
     Args:
-        grid: where the voxels are.
+        grid: of the voxels.
         shaded: the result of `shade_voxels` for the camera that the rays come from.
         rays: with near and far.
         step: distance between samples in world units.
-        stop: transmittance below which a ray is finished.
+        stop: transmittance below which a ray ends.
 
     Returns:
-        Pixels; `samples` counts the samples of positive density.
+        Pixels; `samples` counts those with positive density.
     """
     kernel = compile_function(voxel_rays.render)
     out = np.empty((len(rays), 5), np.float32)
@@ -142,21 +142,21 @@ def voxel_gradients(
     """The mean squared error of pixels, and its gradient with respect to `values`.
 
     Args:
-        grid: as there.
-        values: density and 3 x 9 coefficients of every row.
-        rays: as there, pixel after pixel.
-        basis: spherical harmonics of every ray's direction.
-        truth: what the pixels should be.
-        step: as there.
-        counts: rays of each pixel, at least one, whose mean it is; one each where absent.
-        out: a gradient for each thread of PyTorch, to be written over; the first becomes the result.
-        stop: as there.
+        grid: of the voxels.
+        values: density and 3 x 9 coefficients of each row.
+        rays: with near and far, pixel after pixel.
+        basis: spherical harmonics of the direction of each ray.
+        truth: true colours of the pixels.
+        step: distance between samples in world units.
+        counts: number of rays, at least one, that are averaged for each pixel; by default one.
+        out: buffer with a gradient for each thread of PyTorch; the first becomes the result.
+        stop: transmittance below which a ray ends.
 
     Returns:
         The error, and its gradient.
     """
     kernel, threads = compile_function(voxel_rays.add_gradients), torch.get_num_threads()
-    chunk = max(1, -(-len(truth) // threads))  # one a thread, each with a gradient of its own
+    chunk = max(1, -(-len(truth) // threads))  # one chunk per thread, each with its own gradient
     found = torch.empty(threads, *values.shape) if out is None else out
     found.zero_()
     pixels = torch.arange(len(rays) + 1) if counts is None else pad(counts.cumsum(0), (1, 0))
@@ -173,7 +173,7 @@ def voxel_gradients(
 
 
 def _arrays(grid: VoxelGrid, values: Tensor, rays: Rays) -> tuple[npt.NDArray[Any], ...]:
-    """What both kernels read, rays in units of cells."""
+    """The inputs of both kernels, with rays in units of cells."""
     return (
         grid.rows.numpy(),
         values.numpy(),
@@ -186,5 +186,5 @@ def _arrays(grid: VoxelGrid, values: Tensor, rays: Rays) -> tuple[npt.NDArray[An
 
 
 def _numbers(step: float, stop: float) -> tuple[np.float32, ...]:
-    """The step, the transmittance at which a ray is finished, and a white background."""
+    """The step, the transmittance at which a ray ends, and a white background."""
     return np.float32(step), np.float32(stop), np.float32(1.0)

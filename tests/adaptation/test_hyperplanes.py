@@ -346,7 +346,7 @@ def test_the_seed_decides_the_weights_and_global_randomness_does_not():
 def test_a_model_that_was_never_shown_its_rig_is_refused(support):
     fresh = HyperPlanes(small_model().config)
     for call in (fresh.prepare, fresh.arrange, fresh.adapt):
-        with pytest.raises(ValueError, match="rig: expected the camera directions of the training's views, got none"):
+        with pytest.raises(ValueError, match="rig: expected the camera directions of the training views, got none"):
             call(support)
 
 

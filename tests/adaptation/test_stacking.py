@@ -265,7 +265,7 @@ def test_a_field_that_knows_views_by_their_places_is_not_stacked():
         HyperPlanes(replace(ModelConfig(), gated=True))
     with pytest.raises(ValueError, match="hull_share: .* got point_multiplane"):
         HyperPlanes(replace(ModelConfig(), hull_share=0.5))
-    with pytest.raises(ValueError, match=r"hull_share: expected 0 where views decide it"):
+    with pytest.raises(ValueError, match=r"hull_share: expected 0 for a stacked model"):
         replace(CONFIG, hull_share=0.5)
     with pytest.raises(ValueError, match="hull_share: expected a share"):
         replace(CONFIG, stacked=False, hull_share=1.5)

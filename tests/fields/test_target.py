@@ -254,7 +254,7 @@ def test_a_hidden_plane_is_five_zeros():
 
 
 def test_an_abstract_target_says_so():
-    with pytest.raises(TypeError, match="Target does not say what it reads"):
+    with pytest.raises(TypeError, match="Target does not define input_size"):
         Target(SMALL)
 
 
