@@ -154,7 +154,7 @@ def test_rays_go_through_the_pixels_whose_colours_they_have_in_any_precision():
 @pytest.mark.parametrize("dtype", [torch.int32, torch.uint8, torch.bool])
 def test_there_are_no_views_of_whole_numbers(dtype, tmp_path):
     for call in (views().to, lambda dtype: small_model().save(tmp_path, dtype)):
-        with pytest.raises(ValueError, match=f"dtype: expected one of floating-point numbers, got {dtype}"):
+        with pytest.raises(ValueError, match=f"dtype: expected a floating-point type, got {dtype}"):
             call(dtype=dtype)
     assert not list(tmp_path.iterdir())
 
@@ -237,9 +237,9 @@ def test_a_task_names_its_object():
             lambda images: images * 255,
             "expected finite numbers in .0, 1., got 0 to 255; divide 8-bit pixels",
         ),
-        (lambda images: (images * 255).to(torch.uint8), "got a tensor of uint8, shape .*/ 255 converts 8-bit"),
+        (lambda images: (images * 255).to(torch.uint8), "got a tensor of uint8, shape .*/ 255 makes them of 8-bit"),
         (lambda images: images * float("nan"), "expected finite numbers in .0, 1., got nan"),
-        (lambda images: images > 0.5, r"got a tensor of bool, shape .*; x.float\(\) converts booleans"),
+        (lambda images: images > 0.5, r"got a tensor of bool, shape .*; x.float\(\) makes them of booleans"),
         (lambda images: images.numpy(), "got a numpy.ndarray; torch.from_numpy"),
         (lambda images: None, "got None"),
     ],
