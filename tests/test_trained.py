@@ -62,7 +62,7 @@ def trained(shape):
     """A field that reads no image, so that all it knows of an object is the update; some seconds of training."""
     network = TargetConfig(depth=2, width=24, planes=1, point_frequencies=2, direction_frequencies=1)
     model = small_model(target="nerf", network=network, hypernetwork=shape)
-    config = TrainingConfig(steps=40, tasks=4, rays=48, learning_rate=1e-2, hypernetwork_learning_rate=3e-3)
+    config = TrainingConfig(steps=70, tasks=4, rays=48, learning_rate=1e-2, hypernetwork_learning_rate=3e-3)
     trainer = Trainer(model, ManyBalls(), replace(config, held_out=0))
     while trainer.step < config.steps:
         trainer.take_step()
