@@ -235,7 +235,8 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
             ["demo", "--first-only", "--meshes", "OUT/none", "--out", "OUT/demo"],
             ["--meshes: expected a folder of mesh files, got OUT/none, which is nothing"],
         ),
-        ([*RENDER, "--orbit", "0"], ["--orbit: expected at least 1 frame, got 0"]),
+        ([*RENDER, "--orbit", "0"], ["--orbit: expected 1 to 10000 frames, got 0"]),
+        ([*RENDER, "--orbit", "100000000"], ["--orbit: expected 1 to 10000 frames, got 100000000"]),
         ([*RENDER, "--size", "32"], ["--size: expected --orbit or --camera-path, whose pictures it is for, got 32"]),
         ([*RENDER, "--orbit", "2", "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
         ([*BAKE, "OUT/bk"], ["--out: expected a name that ends in .safetensors, got OUT/bk"]),
@@ -302,7 +303,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
             ["--camera-path, --orbit: expected one of them, got both"],
         ),
         ([*RENDER, "--dataparser-transforms", "OUT/a"], ["--dataparser-transforms: expected --camera-path"]),
-        ([*BAKE, "OUT/bk.safetensors", "--orbit", "0"], ["--orbit: expected at least 1 frame, got 0"]),
+        ([*BAKE, "OUT/bk.safetensors", "--orbit", "0"], ["--orbit: expected 1 to 10000 frames, got 0"]),
         (["export", *RENDER[1:], "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
         (["export", *RENDER[1:], "--what", "mesh", "--size", "64"], ["--size: expected --what turntable, whose"]),
         *(
@@ -1035,6 +1036,9 @@ def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_pa
     assert main([*command, str(parts)]) == 0
     assert "going on from step 3" in capsys.readouterr().out
     assert main([*command, str(whole)]) == 0
+    assert capsys.readouterr().out.count("trained for 4 steps\n") == 1
+    assert main([*command[:6], "3", *command[7:], str(whole)]) == 0
+    assert "trained for 4 steps before, and for no more now: --steps is 3" in capsys.readouterr().out
     same = (parts / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
     assert same
 

@@ -74,8 +74,8 @@ class Arguments:
         lpips: Measure LPIPS with these weights, a safetensors file that `hyperplanes.evaluation.perceptual` describes.
         split: Which objects.
         objects: Evaluate only the first N objects.
-        support: Support views an object; more than the data set has are taken from its query views, and those are
-            compared although they were shown, which a warning says.
+        support: Support views an object, the first ones of the data set. If it has fewer, query views are added, which
+            are then compared although they were shown; a warning says so.
         preset: The shape of fields that need no checkpoint.
         up: The direction that points up in the data's world: an axis such as y or -z, three numbers such as 0,0.1,1, or
             auto: of a single scene, from how its cameras are held; of a data set, as its files say, otherwise y as in

@@ -46,6 +46,9 @@ Steps = int | Literal["auto"]
 Free = Literal["weights", "hypernetwork"]
 """What fine-tuning optimises."""
 
+MOST_FRAMES = 10_000
+"""Of an orbit."""
+
 ViewsUp = Annotated[str, tyro.conf.arg(metavar="{auto,y,z,x,-y,-z,-x}")]
 """The axis that points up in the world of photographs, three numbers, or auto: from how the cameras are held."""
 
@@ -120,10 +123,10 @@ def check_orbit(orbit: int | None, size: int | None, *others: str) -> None:
         others: options beside --orbit whose pictures may have that size.
 
     Raises:
-        ValueError: no frame, no pixel, or a size of no orbit.
+        ValueError: no frame or too many, no pixel, or a size of no orbit.
     """
-    if orbit is not None and orbit < 1:
-        raise ValueError(f"--orbit: expected at least 1 frame, got {orbit}")
+    if orbit is not None and not 1 <= orbit <= MOST_FRAMES:
+        raise ValueError(f"--orbit: expected 1 to {MOST_FRAMES} frames, got {orbit}")
     if size is not None and orbit is None:
         those = " or ".join(["--orbit", *others])
         raise ValueError(f"--size: expected {those}, whose pictures it is for, got {size} without; leave it out")

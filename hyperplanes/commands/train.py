@@ -325,7 +325,9 @@ def _run(arguments: Arguments) -> int:
         finally:
             if board is not None:
                 board.close()
-    console.say(f"{arguments.out}: trained for {trainer.step} steps")
+    more = trainer.step > chosen.training.steps
+    before = f" before, and for no more now: --steps is {chosen.training.steps}" if more else ""
+    console.say(f"{arguments.out}: trained for {trainer.step} steps{before}")
     if held_out:
         given = ["--data", arguments.data[0], "--checkpoint", arguments.out, "--method", method]
         given += [] if arguments.support is None else ["--support", arguments.support]

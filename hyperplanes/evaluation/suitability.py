@@ -46,7 +46,7 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
     if unlike is not None and unlike > UNLIKE:
         found.append(
             f"the views are unlike those of the training: their codes deviate {unlike:.1f} times as much as those did"
-            + ("" if steps else "; --steps 100 adapts to them")
+            + ("" if steps or len(shown) < 2 else "; --steps 100 adapts to them")
         )
     if angle > ELSEWHERE and len(shown) >= planes:
         found.append(f"the cameras stand {angle:.0f} degrees from where those of the training stood, on average")
@@ -69,7 +69,9 @@ def worse_than_copying(shown: Views, rendered: float, copied: float, steps: obje
     """
     if rendered >= copied:
         return []
-    advice = "--steps 100 adapts the model to the views" if steps == 0 else "check masks, poses and --up"
+    advice = "`hyperplanes inspect` checks images, masks and poses"
+    if steps == 0 and len(shown) > 1:
+        advice += ", and --steps 100 adapts the model to the views"
     advice = "cut the object out first" if _covered(shown) > COVERED else advice
     return [f"worse than copying the nearest view: {rendered:.2f} dB against {copied:.2f} dB; {advice}"]
 

@@ -89,7 +89,9 @@ def render(
         background: grey value behind everything.
         differentiable: whether to keep gradients with respect to whatever the field and the rays depend on; by default
             for rays, but not for cameras. Without gradients, rays are rendered in chunks, so that memory does not grow
-            with their number, and `RayMarching` ends rays where they are opaque.
+            with their number, and `RayMarching` ends rays where they are opaque. Distances of its samples along the
+            rays are constants: gradients with respect to cameras are exact for fields that vanish at the sphere, and
+            otherwise leave out how the sphere clips them.
         chunk: rays rendered at once without gradients; the default suits the sampler and the device.
         antialias: for cameras, five rays through each pixel that differs much from a neighbour; by default for
             `RayMarching` without gradients. The paper's protocol is one ray per pixel.

@@ -76,7 +76,7 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
     from safetensors import SafetensorError, safe_open
 
     if not path.exists():
-        raise CheckpointError(f"{path}: expected weights, found no file; `hyperplanes train` writes them")
+        raise CheckpointError(f"{path}: expected weights, found no file; check the path")
     files.check_regular(path, LARGEST)
     try:
         with safe_open(path, "pt") as file:

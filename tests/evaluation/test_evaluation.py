@@ -188,12 +188,13 @@ def test_asking_whether_views_suit_changes_no_model_in_training():
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
 
-@pytest.mark.parametrize(("steps", "advice"), [(0, "--steps 100 adapts"), (5, "check masks"), (None, "check masks")])
-def test_steps_are_advised_where_they_can_be_taken(steps, advice):
-    """A baked file, whose steps are None, refuses `--steps`."""
-    views = ball_views(ring(4, (12, 12)))
-    views = replace(views, masks=torch.zeros(4, 1, 12, 12))
+@pytest.mark.parametrize(("steps", "count", "advised"), [(0, 4, True), (0, 1, False), (5, 4, False), (None, 4, False)])
+def test_steps_are_advised_where_they_can_be_taken(steps, count, advised):
+    """A baked file, whose steps are None, refuses `--steps`, and so does a model of any number of views with one."""
+    views = ball_views(ring(4, (12, 12)))[:count]
+    views = replace(views, masks=torch.zeros(count, 1, 12, 12))
     (line,) = worse_than_copying(views, 10.0, 12.0, steps)
     assert "worse than copying the nearest view: 10.00 dB against 12.00 dB" in line
-    assert advice in line
+    assert "`hyperplanes inspect` checks images, masks and poses" in line
+    assert ("--steps 100" in line) == advised
     assert worse_than_copying(views, 12.0, 12.0, steps) == []
