@@ -12,7 +12,7 @@ import numpy as np
 
 from hyperplanes.capture.masks.choice import check_mask, choose_masker
 from hyperplanes.capture.masks.consistency import agree
-from hyperplanes.capture.packages import is_installed
+from hyperplanes.capture.packages import is_installed, require
 from hyperplanes.capture.photographs import (
     FEWEST,
     Photograph,
@@ -167,6 +167,7 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
     folder = work.stages.folder / "pictures"
     done = work.stages.begin("pictures", key)
     if done is None:
+        require("pycolmap", "finds camera poses")  # which `_poses` needs, before minutes of scaling
         done = {"sizes": [], "masked": [], "broken": {}}
         with_alpha, transparent = list[int](), False
         for index, one in enumerate(photographs):
@@ -242,10 +243,11 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
         if found is not None and (best is None or len(found) > len(best)):
             best = found
     if best is None or len(best) < FEWEST:
+        found = f"{len(pictures)} of which none can" if best is None else f"only {len(best)} of {len(pictures)}"
         raise DataError(
             work.stages.folder.parent,
             f"photographs of which at least {FEWEST} can be posed together",
-            f"{len(pictures)} of which none can" if best is None else f"only {len(best)} of {len(pictures)}",
+            "; ".join([found, *work.notes]),
             ADVICE,
         )
     if len(best) < ENOUGH * len(pictures):

@@ -132,3 +132,22 @@ def test_photographs_of_nothing_in_common_are_answered_with_advice(tmp_path):
         )
     with pytest.raises(ValueError, match="3 of which none can; walk around the object in small steps"):
         capture(tmp_path, tmp_path / "scene")
+    # one that cannot be read is named, too
+    (tmp_path / "cut.png").write_bytes((tmp_path / "0.png").read_bytes()[:-2000])
+    with pytest.raises(ValueError, match="3 of which none can; .*cut.png.*; walk around the object in small steps"):
+        capture(tmp_path, tmp_path / "other")
+
+
+def test_a_missing_package_is_said_before_photographs_are_scaled(tmp_path, monkeypatch):
+    from hyperplanes.capture import capture, pipeline
+
+    def missing(*_):
+        raise ValueError("no pycolmap")
+
+    for index in range(3):
+        Image.fromarray(np.full((60, 80, 3), index, dtype=np.uint8)).save(tmp_path / f"{index}.png")
+    monkeypatch.setattr(pipeline, "require", missing)
+    scaled = []
+    with pytest.raises(ValueError, match="no pycolmap"):
+        capture(tmp_path, tmp_path / "scene", progress=lambda stage, *_: scaled.append(stage))
+    assert "photographs" not in scaled
