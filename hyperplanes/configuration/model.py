@@ -140,8 +140,14 @@ class ModelConfig:
             A configuration with all numbers in their ranges.
 
         Raises:
-            CheckpointError: an unknown or missing entry, or one of a wrong type or out of range.
+            CheckpointError: an unknown or missing entry, one of a wrong type or out of range, or a field that no
+                installed package has.
         """
+        target, known = value.get("target"), find_targets()
+        if isinstance(target, str) and target not in known:
+            raise CheckpointError(
+                f"{where}: expected a field of {', '.join(known)}, found {target!r}; install the package that adds it"
+            )
         try:
             return cls.structured(value)
         except SettingsError as error:
