@@ -76,7 +76,9 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
     from safetensors import SafetensorError, safe_open
 
     if not path.exists():
-        raise CheckpointError(f"{path}: expected weights, found no file; check the path")
+        raise CheckpointError(
+            f"{path}: expected weights, found no file; check the path; `hyperplanes train` writes those of models"
+        )
     files.check_regular(path, LARGEST)
     try:
         with safe_open(path, "pt") as file:
