@@ -146,7 +146,7 @@ class ModelConfig:
         target, known = value.get("target"), find_targets()
         if isinstance(target, str) and target not in known:
             raise CheckpointError(
-                f"{where}: expected a field of {', '.join(known)}, found {target!r}; install the package that adds it"
+                f"{where}: target: expected one of {', '.join(known)}, got {target!r}; install the package that adds it"
             )
         try:
             return cls.structured(value)

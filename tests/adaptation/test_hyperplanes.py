@@ -236,7 +236,7 @@ def test_a_configuration_that_does_not_fit_is_a_checkpoint_error(change):
 
 def test_a_field_of_a_package_that_is_not_installed_is_said_to_be_one():
     value = {**ModelConfig().as_json(), "target": "of_a_plugin"}
-    with pytest.raises(CheckpointError, match="found 'of_a_plugin'; install the package that adds it"):
+    with pytest.raises(CheckpointError, match="got 'of_a_plugin'; install the package that adds it"):
         ModelConfig.of_json(value)
 
 
