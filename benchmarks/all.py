@@ -65,8 +65,8 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
         ["posed"],
         ["--query", "5", "--counts", "1", "3", "5", "25", "50", *_METHODS, "uncorrected"],
     ),
-    "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "5", *_METHODS]),
-    "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "5", *_METHODS]),
+    "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "10", *_METHODS]),
+    "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "10", *_METHODS]),
     "views_rotated": (
         ["procedural", "cc0"],
         ["--objects", "5", "--query", "2", "--counts", "2", "3", "5", "12", "--rotated", "33"]

@@ -530,10 +530,14 @@ def test_a_learned_initialisation_is_trained_matched_and_evaluated(tmp_path, mon
     assert set(json.loads(table.read_text())) == set(methods)
 
 
-def test_render_writes_the_query_views_under_their_names(tmp_path):
+def test_render_writes_the_query_views_under_their_names(tmp_path, capsys):
     demo = demo_folder()
     scene = first_object(demo)
+    older = tmp_path / "older.png"
+    older.touch()
     assert main(["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path)]) == 0
+    assert f"{tmp_path}: pictures of an earlier command are still there: older.png" in capsys.readouterr().err
+    older.unlink()
     document = json.loads((scene / "transforms.json").read_text())
     assert {path.name for path in tmp_path.iterdir()} == {Path(name).name for name in document["test_filenames"]}
     pictures = demo / "pictures" / "hyperplanes" / scene.name

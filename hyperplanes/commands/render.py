@@ -110,6 +110,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
+    from hyperplanes.data.pictures.frames import listed
     from hyperplanes.evaluation.suitability import held_out_psnr, worse_than_copying
     from hyperplanes.export.animation import choose_representation
     from hyperplanes.export.baking import BakedScene
@@ -177,6 +178,8 @@ def run(arguments: Arguments) -> int:
     steps = None if isinstance(source, BakedScene) else arguments.steps
     for line in worse_than_copying(shown, *scores, steps) if scores else []:
         console.warn(f"{task.name}: {line}")
+    if older := sorted({path.name for path in arguments.out.glob("*.png")} - {path.name for path in paths}):
+        console.warn(f"{arguments.out}: pictures of an earlier command are still there: {listed(older)}")
     how = " corrected by residuals" if corrected else ""
     console.say(f"{arguments.out}: {len(paths)} pictures{how}, {format_duration(seconds)} a view")
     return 0
