@@ -536,7 +536,7 @@ def test_render_writes_the_query_views_under_their_names(tmp_path, capsys):
     older = tmp_path / "older.png"
     older.touch()
     assert main(["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path)]) == 0
-    assert f"{tmp_path}: pictures of an earlier command are still there: older.png" in capsys.readouterr().err
+    assert f"{tmp_path}: pictures that this command did not write are there: older.png" in capsys.readouterr().err
     older.unlink()
     document = json.loads((scene / "transforms.json").read_text())
     assert {path.name for path in tmp_path.iterdir()} == {Path(name).name for name in document["test_filenames"]}

@@ -179,7 +179,7 @@ def run(arguments: Arguments) -> int:
     for line in worse_than_copying(shown, *scores, steps) if scores else []:
         console.warn(f"{task.name}: {line}")
     if older := sorted({path.name for path in arguments.out.glob("*.png")} - {path.name for path in paths}):
-        console.warn(f"{arguments.out}: pictures of an earlier command are still there: {listed(older)}")
+        console.warn(f"{arguments.out}: pictures that this command did not write are there: {listed(older)}")
     how = " corrected by residuals" if corrected else ""
     console.say(f"{arguments.out}: {len(paths)} pictures{how}, {format_duration(seconds)} a view")
     return 0

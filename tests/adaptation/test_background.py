@@ -108,6 +108,18 @@ def test_view_shows_the_object_alone(scene, monkeypatch, tmp_path):
         torch.testing.assert_close(corner, torch.ones_like(corner), atol=0.02, rtol=0)
 
 
+def test_without_the_outer_grid_the_sphere_holds_the_background(scene, monkeypatch):
+    views, outlines = scene
+    read = background._read
+
+    def nothing_outside(grid, points, bounds, lengths):
+        depth, colour = read(grid, points, bounds, lengths)
+        return (0 * depth, 1 + 0 * colour) if bounds.radius == 2.0 else (depth, colour)
+
+    monkeypatch.setattr(background, "_read", nothing_outside)
+    assert overlap(separate_background(views).cut_out(views), outlines) < 0.6
+
+
 def test_too_few_views_are_refused(scene):
     with pytest.raises(ValueError, match="views: expected at least 5 without lens distortion, got 4"):
         separate_background(scene[0][:4])
