@@ -18,7 +18,6 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from hyperplanes.data.formats.unposed import find_video, photographs_folder
-from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import (
     HEIF_SUFFIXES,
     PICTURE_SUFFIXES,
@@ -28,6 +27,7 @@ from hyperplanes.data.pictures.images import (
     turned,
 )
 from hyperplanes.data.pictures.masks import match_masks
+from hyperplanes.utilities.errors import listed
 from hyperplanes.utilities.files import DataError
 
 __all__ = ["FEWEST", "Photograph", "find_photographs", "list_photographs", "read_upright", "without_copies"]

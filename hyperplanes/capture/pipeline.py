@@ -27,11 +27,11 @@ from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages, fingerprint
 from hyperplanes.capture.structure_from_motion import ATTEMPTS, EXHAUSTIVE, Picture, Progress, find_poses
 from hyperplanes.capture.video import take_frames
-from hyperplanes.data.pictures.frames import listed
 from hyperplanes.data.pictures.images import VIDEO_SUFFIXES, Pixels, read_image
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.utilities.encoding import encode_jpeg, encode_png, sha256
+from hyperplanes.utilities.errors import listed
 from hyperplanes.utilities.files import DataError
 from hyperplanes.utilities.writing import write_whole
 

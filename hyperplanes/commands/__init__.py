@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from hyperplanes.utilities.entry_points import find_entries
+from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.errors import nearest
 
 __all__ = ["EXAMPLES", "VERBS", "Verb", "find_verb", "find_verbs", "split_settings"]
@@ -61,7 +61,7 @@ EXAMPLES = """\
 def find_verbs() -> dict[str, Verb]:
     """All verbs by name: those of this package, then those of the other packages that are installed."""
     own = {name: Verb(f"{__name__}.{name}", about) for name, about in VERBS.items()}
-    return own | {entry.name: entry.load() for entry in find_entries(__name__) if entry.name not in own}
+    return own | load_entries(__name__, own)
 
 
 def find_verb(name: str) -> Verb:

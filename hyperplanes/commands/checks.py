@@ -8,11 +8,12 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, entry_points, requires, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.environment import usable_cores
 
 if TYPE_CHECKING:
@@ -68,8 +69,8 @@ def examine() -> list[Check]:
     checks = [_python(), _torch(), _packages()]
     if all(check.works for check in checks):
         checks += _lookups()
-        for entry in entry_points(group=GROUP):
-            checks += entry.load()()
+        for further in load_entries(GROUP).values():
+            checks += further()
     return [*checks, _disk(Path()), *(_optional(module) for module in OPTIONAL)]
 
 

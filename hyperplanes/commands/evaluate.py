@@ -126,7 +126,6 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data import open_dataset
     from hyperplanes.data.devices import TasksOnDevice, choose_device
-    from hyperplanes.data.pictures.frames import listed
     from hyperplanes.data.support import WithSupport
     from hyperplanes.evaluation import evaluate_all
     from hyperplanes.evaluation.comparison import compare_all
@@ -135,6 +134,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.evaluation.perceptual import LPIPS
     from hyperplanes.evaluation.tables import PAIR_HEADINGS, compared_rows, headings, rows
     from hyperplanes.methods import Request, WithSampler, at_steps, make_method
+    from hyperplanes.utilities.errors import listed
     from hyperplanes.utilities.plots import figure_kind
 
     if not arguments.method:

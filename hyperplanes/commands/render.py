@@ -110,13 +110,13 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
-    from hyperplanes.data.pictures.frames import listed
     from hyperplanes.evaluation.suitability import held_out_psnr, worse_than_copying
     from hyperplanes.export.animation import choose_representation
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.images import encode_animation
     from hyperplanes.export.outputs import output_frames, save_outputs
     from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
+    from hyperplanes.utilities.errors import listed
     from hyperplanes.utilities.writing import write_whole
 
     _check(arguments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Collection
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -19,10 +20,23 @@ def load_entries(group: str, own: Collection[str] = ()) -> dict[str, Any]:
         own: reserved names, whose entries are left out.
 
     Returns:
-        The objects by name; each is imported once. One that cannot be imported is a ValueError that names its
-        package.
+        The objects by name; each is imported once. One that cannot be imported is left out, with a warning that names
+        its package, so that a broken package does not stop commands that do not need it.
     """
-    return {entry.name: _load(entry) for entry in find_entries(group) if entry.name not in own}
+    loaded = {}
+    for entry in find_entries(group):
+        if entry.name in own:
+            continue
+        try:
+            loaded[entry.name] = _load(entry)
+        except Exception as error:  # importing another package can raise anything
+            package = entry.dist.name if entry.dist else entry.value
+            warnings.warn(
+                f"{package}: {entry.name!r} of {entry.group} is left out, {entry.value} cannot be imported "
+                f"({type(error).__name__}: {error}); update or remove that package",
+                stacklevel=2,
+            )
+    return loaded
 
 
 def find_entries(group: str) -> tuple[EntryPoint, ...]:
@@ -37,11 +51,4 @@ def _find_entries(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
 
 @cache
 def _load(entry: EntryPoint) -> Any:
-    try:
-        return entry.load()
-    except (ImportError, AttributeError) as error:
-        package = entry.dist.name if entry.dist else entry.value
-        raise ValueError(
-            f"{package}: expected {entry.value} for {entry.group} {entry.name!r}, found none ({error}); "
-            "update or remove that package"
-        ) from None
+    return entry.load()

@@ -13,6 +13,7 @@ __all__ = [
     "MissingPackageError",
     "did_you_mean",
     "is_memory",
+    "listed",
     "nearest",
     "one_line",
     "prefix_errors",
@@ -21,6 +22,7 @@ __all__ = [
 ]
 
 TRACEBACK_VARIABLE = "HYPERPLANES_TRACEBACK"
+MOST_NAMES = 20  # in a message
 
 
 class MissingPackageError(RuntimeError):
@@ -44,6 +46,16 @@ def nearest(name: str, known: Sequence[str]) -> str:
     'did you mean steps?'
     """
     return did_you_mean(name, known).removeprefix("; ") or f"expected one of {', '.join(known)}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names for a message: all of them, or the first ones and how many more there are.
+
+    >>> listed(["a", "b"]), listed(["a"] * 22)[-15:]
+    ('a, b', 'a, a and 2 more')
+    """
+    shown = ", ".join(names[:MOST_NAMES])
+    return shown if len(names) <= MOST_NAMES else f"{shown} and {len(names) - MOST_NAMES} more"
 
 
 @contextmanager

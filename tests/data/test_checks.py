@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_splits
+from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_masks, check_poses, check_splits
 from hyperplanes.data.inspection.conventions import check_conventions
 from hyperplanes.data.inspection.describe import describe
 from hyperplanes.data.inspection.matches import match_pictures, sampson
@@ -158,3 +158,21 @@ def test_splits_in_different_worlds_are_found(scene):
     fine, line = check_splits(opaque[::2], moved(opaque[1::2], turn))
     assert not fine
     assert "corners matched between support and query" in line
+
+
+def test_one_pose_for_many_pictures_is_found(scene):
+    views = balls(type(scene))
+    assert check_poses(views) is None
+    same = views.cameras.extrinsics[[0] * 7 + list(range(7, 12))]
+    repeated = replace(views, cameras=camera.with_poses(views.cameras, same))
+    assert "poses: WRONG, 7 of 12 are the same" in check_poses(repeated)
+    assert check_poses(views[[0, 0, 0, 1, 2, 3]]) is None  # half of the pictures, from a tripod
+
+
+def test_masks_that_show_the_background_are_found(scene):
+    views = balls(type(scene))
+    assert check_masks(views) is None
+    assert check_masks(replace(views, masks=None)) is None
+    masks = views.masks.clone()
+    masks[[2, 5]] = 1 - masks[[2, 5]]
+    assert "masks: WRONG, 2 of 12 seem to show the background (2, 5)" in check_masks(replace(views, masks=masks))

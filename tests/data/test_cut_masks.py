@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hyperplanes.data.inspection.conventions import check_conventions
-from hyperplanes.data.pictures.bounds import are_inverted, estimate_bounds
+from hyperplanes.data.pictures.bounds import cut_off, estimate_bounds, inverted
 from hyperplanes.data.pictures.posed import posed
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry import cast
@@ -45,11 +45,25 @@ def test_masks_of_the_background_are_told_from_those_of_close_ups(close_ups):
     near = masks[masks.flatten(1).mean(1) > 0.8]  # which fill their pictures
     assert len(near) >= 3
     for found in (masks, near, torch.ones_like(masks), torch.zeros_like(masks), masks[:0]):
-        assert not are_inverted(found)
-        assert not are_inverted((255 * found).to(torch.uint8))
+        assert not inverted(found).any()
+        assert not inverted((255 * found).to(torch.uint8)).any()
     shown_whole = masks[masks.flatten(1).mean(1) < 0.5]
-    assert are_inverted(1 - shown_whole)
-    assert are_inverted((255 * (1 - shown_whole)).to(torch.uint8))
+    assert inverted(1 - shown_whole).all()
+    assert inverted((255 * (1 - shown_whole)).to(torch.uint8)).all()
+
+
+def test_single_masks_of_the_background_are_found_if_the_others_show_the_object_whole(close_ups):
+    masks, _ = close_ups
+    whole = masks[~cut_off(masks)]
+    assert len(whole) >= 3
+    some = torch.tensor([1, len(whole) - 1])
+    mixed = whole.clone()
+    mixed[some] = 1 - mixed[some]
+    assert inverted(mixed).nonzero()[:, 0].tolist() == some.tolist()
+    holed = masks[masks.flatten(1).mean(1) > 0.8].clone()  # close-ups, of which one shows the background through a hole
+    holed[0] = 1.0
+    holed[0, :, 20:24, 20:24] = 0.0
+    assert not inverted(holed).any()
 
 
 @pytest.mark.parametrize("has_alpha", [True, False])

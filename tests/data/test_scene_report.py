@@ -57,7 +57,13 @@ def test_masks_that_show_the_background_are_to_be_inverted():
     views = ball()
     assert describe_scene(views).expectation().startswith("good pictures")
     found = describe_scene(replace(views, masks=1 - views.masks)).expectation()
-    assert found == "poor pictures: masks seem to show the background; invert them, white is the object"
+    assert found == "poor pictures: 12 of 12 masks seem to show the background; invert them, white is the object"
+    one = views.masks.clone()
+    one[3] = 1 - one[3]
+    report = describe_scene(replace(views, masks=one))
+    assert report.expectation().startswith("poor pictures: 1 of 12 masks")
+    assert "the mask seems to show the background" in report.views[3].faults
+    assert [view.name for view in report.views if view.faults] == [report.views[3].name]
 
 
 def test_the_widest_gap_lies_between_views_that_are_named():

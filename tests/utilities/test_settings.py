@@ -14,10 +14,11 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes, ModelConfig, NearestV
 from hyperplanes.adaptation.checkpoints import find_checkpoints
 from hyperplanes.adaptation.fine_tuned import FineTuned
 from hyperplanes.cli import main
+from hyperplanes.commands import find_verbs
 from hyperplanes.commands.train import Arguments, resolve
 from hyperplanes.configuration.presets import PRESETS, preset
 from hyperplanes.configuration.settings_file import changed, document, parse_options, read_experiment, write_experiment
-from hyperplanes.fields import ImageBasedConfig, NeRF, TargetConfig, find_targets
+from hyperplanes.fields import TARGETS, ImageBasedConfig, NeRF, TargetConfig, find_targets
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.methods import Method, Request, describe_method, make_method
 from hyperplanes.rendering import Hierarchical, RayMarching
@@ -368,10 +369,15 @@ def test_names_that_other_packages_bring_are_in_the_help(monkeypatch, capsys):
     assert "Fields of other packages: constant." in told
 
 
-def test_an_entry_point_that_cannot_be_loaded_names_its_package(other_package, monkeypatch):
-    monkeypatch.setitem(BROUGHT, "hyperplanes.fields", {"lost": "no.such.module:Field"})
-    with pytest.raises(ValueError, match="other-package: expected no.such.module:Field for hyperplanes.fields 'lost'"):
-        find_targets()
+def test_an_entry_point_that_cannot_be_imported_is_left_out_and_its_package_named(other_package, monkeypatch):
+    fields = {"lost": "no.such.module:Field", "constant": f"{__name__}:Constant", "gone": f"{__name__}:Gone"}
+    monkeypatch.setitem(BROUGHT, "hyperplanes.fields", fields)
+    with pytest.warns(UserWarning, match="other-package: '(lost|gone)' of hyperplanes.fields is left out") as warned:
+        assert set(find_targets()) - set(TARGETS) == {"constant"}
+    assert len(warned) == 2
+    monkeypatch.setitem(BROUGHT, "hyperplanes.commands", {"lost": "no.such.module:VERB"})
+    with pytest.warns(UserWarning, match="'lost' of hyperplanes.commands is left out"):
+        assert "lost" not in find_verbs()
 
 
 def test_every_option_that_the_documents_name_is_one():

@@ -7,13 +7,15 @@ import torch
 from hyperplanes.data.inspection.conventions import FEWEST_MATCHES, LEAST_COVERAGE, RANDOM, near_lines
 from hyperplanes.data.inspection.matches import match_pictures
 from hyperplanes.data.inspection.silhouettes import coarse_hull, masks_tell, small_masks
-from hyperplanes.data.pictures.bounds import nearest_point
+from hyperplanes.data.pictures.bounds import inverted, nearest_point
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.errors import listed
 from hyperplanes.views import Views
 
-__all__ = ["check_duplicates", "check_gaze", "check_splits"]
+__all__ = ["check_duplicates", "check_gaze", "check_masks", "check_poses", "check_splits"]
 
 PARALLEL = 1e-6  # from 1, the cosine of the angle between two axes: 0.08 degrees
+SAME = 1e-6  # largest difference between the entries of two poses that count as one
 
 
 def check_duplicates(views: Views) -> str | None:
@@ -31,6 +33,29 @@ def check_duplicates(views: Views) -> str | None:
     return (
         f"pictures: WRONG, {count} of {len(views)} poses have the picture of another pose ({names[largest[0]]} and "
         f"{names[largest[1]]} are the same, {len(largest)} times in all); give every pose its own picture"
+    )
+
+
+def check_poses(views: Views) -> str | None:
+    """A sentence where more than half of three or more views have one and the same pose, otherwise None."""
+    pose = camera.camera_from_world(views.cameras).reshape(len(views), -1)
+    same = int(((pose[:, None] - pose).abs().amax(-1) < SAME).sum(1).max())
+    if len(views) < 3 or 2 * same <= len(views):
+        return None
+    return (
+        f"poses: WRONG, {same} of {len(views)} are the same; give every picture the pose of the camera relative to the "
+        "object (on a turntable, the camera moves around the object)"
+    )
+
+
+def check_masks(views: Views) -> str | None:
+    """A sentence where masks seem to show the background, otherwise None."""
+    if views.masks is None or not (wrong := inverted(views.masks).nonzero()[:, 0].tolist()):
+        return None
+    names = listed([views.names[index] if views.names else str(index) for index in wrong])
+    return (
+        f"masks: WRONG, {len(wrong)} of {len(views)} seem to show the background ({names}); invert them, white is the "
+        "object"
     )
 
 

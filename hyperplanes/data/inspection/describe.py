@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from hyperplanes.data.dataset import Dataset
-from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_splits
+from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_masks, check_poses, check_splits
 from hyperplanes.data.inspection.conventions import Conventions, check_conventions
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
@@ -189,6 +189,7 @@ def _checked(task: Task) -> tuple[tuple[str, ...], tuple[str, ...]]:
     halves = task.support, task.query
     parts = [join_views(*halves)] if task.support.size == task.query.size else halves
     outcomes = [each for each in (check_gaze(task.support), check_splits(*halves)) if each is not None]
-    problems = [same for part in parts if (same := check_duplicates(part))]
+    checks = (check_duplicates, check_poses, check_masks)
+    problems = [line for part in parts for check in checks if (line := check(part))]
     problems += [line for fine, line in outcomes if not fine]
     return tuple(problems), tuple(line for fine, line in outcomes if fine)

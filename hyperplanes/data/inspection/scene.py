@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate, normalize
 
 from hyperplanes.data.formats.sparse_points import SparsePoints
 from hyperplanes.data.inspection.silhouettes import CoarseHull, masks_tell, small_masks
-from hyperplanes.data.pictures.bounds import are_inverted, cut_off
+from hyperplanes.data.pictures.bounds import cut_off, inverted
 from hyperplanes.data.upright import guess_up, upright
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
@@ -77,7 +77,7 @@ class SceneReport:
         rarely_shown: share of that surface that fewer than three views show, or None.
         sparse: points of a reconstruction, or None.
         masked: whether the views have masks.
-        inverted: whether these seem to show the background.
+        inverted: how many of these seem to show the background.
     """
 
     views: tuple[ViewReport, ...]
@@ -89,7 +89,7 @@ class SceneReport:
     rarely_shown: float | None
     sparse: SparsePoints | None = None
     masked: bool = True
-    inverted: bool = False
+    inverted: int = 0
 
     @property
     def worst(self) -> list[ViewReport]:
@@ -138,7 +138,10 @@ class SceneReport:
         if not self.masked:
             return "poor pictures: there are no masks, which packaged models need; --learn-background makes rough ones"
         if self.inverted:
-            return "poor pictures: masks seem to show the background; invert them, white is the object"
+            return (
+                f"poor pictures: {self.inverted} of {len(self.views)} masks seem to show the background; invert them, "
+                "white is the object"
+            )
         unseen = [side for side, share in (("above", self.above), ("below", self.below)) if share < 0.25]
         if self.covered < 0.25:
             text = "good pictures only from near where the views stand; other sides are guessed"
@@ -180,12 +183,13 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
     middle = None if agreement is None else float(agreement.median())
     sharp = _sharpness(views, apart)
     cut = cut_off(views.masks) if views.masks is not None else torch.zeros(len(views), dtype=torch.bool)
+    background = inverted(views.masks) if views.masks is not None else torch.zeros_like(cut)
     errors: Mapping[str, float] = {} if sparse is None else sparse.errors
     usual = median(errors.values()) if errors else None
     reports = []
     for index, name in enumerate(names):
         fit = None if agreement is None else float(agreement[index])
-        faults = []
+        faults = ["the mask seems to show the background"] if background[index] else []
         if fit is not None and middle is not None and fit < middle - UNLIKE:
             faults.append(f"mask and the hull of all masks agree by {fit:.0%}, in the median {middle:.0%}")
         if float(sharp[index]) < BLURRED:
@@ -213,7 +217,7 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
         None if shown is None else float((shown < 3).double().mean()),
         sparse,
         views.masks is not None,
-        views.masks is not None and are_inverted(views.masks),
+        int(background.sum()),
     )
 
 

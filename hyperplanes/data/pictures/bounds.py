@@ -20,10 +20,10 @@ from hyperplanes.utilities.files import DataError
 __all__ = [
     "OFTEN_CUT",
     "ROOM",
-    "are_inverted",
     "are_shown",
     "cut_off",
     "estimate_bounds",
+    "inverted",
     "nearest_point",
     "smallest_ball",
     "stated_bounds",
@@ -96,16 +96,21 @@ def cut_off(masks: Float[Tensor, "view 1 height width"]) -> Bool[Tensor, " view"
     return torch.cat(sides, -1).any(-1)
 
 
-def are_inverted(masks: Float[Tensor, "view 1 height width"] | UInt8[Tensor, "view 1 height width"]) -> bool:
-    """Whether masks seem to show the background: most cover their picture's border, and what they leave is within it.
+def inverted(
+    masks: Float[Tensor, "view 1 height width"] | UInt8[Tensor, "view 1 height width"],
+) -> Bool[Tensor, " view"]:
+    """Which masks seem to show the background: they cover the border of their picture, and less of what is within it.
 
-    An object that fills its pictures reaches their borders, too, and leaves less within them.
+    A close-up of an object covers its border, too. A minority of such masks is reported only if most of the other
+    masks do not reach the border.
     """
-    if not len(masks):
-        return False
     opaque = masks[:, 0] > (127 if masks.dtype == torch.uint8 else 0.5)
     border = torch.cat([opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]], -1).float().mean(-1)
-    return float(border.median()) > BORDER and float(opaque.float().mean()) < float(border.mean())
+    found = (border > BORDER) & (opaque.flatten(1).float().mean(-1) < border)
+    most = 2 * int(found.sum()) > len(masks)
+    if most or (found.any() and 2 * int(cut_off(masks[~found]).sum()) < int((~found).sum())):
+        return found
+    return torch.zeros_like(found)
 
 
 def are_shown(

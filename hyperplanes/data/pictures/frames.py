@@ -26,14 +26,14 @@ from hyperplanes.data.pictures.images import (
 from hyperplanes.data.pictures.posed import Posed, posed
 from hyperplanes.data.pictures.undistort import check_lens, undistort
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.errors import listed
 from hyperplanes.utilities.files import DataError
 
-__all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "centred_matrix", "listed", "scaled_matrix"]
+__all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "centred_matrix", "scaled_matrix"]
 
 MEGAPIXEL = 2**20
 """Pixels above which photographs are scaled down unless the caller says by how much."""
 
-MOST_NAMES = 20  # in a message
 ENOUGH = 2 / 3  # of the frames of a file must be there
 ROUNDING = 1.01  # pixels by which a picture scaled to whole pixels may differ from the exact size
 
@@ -161,16 +161,6 @@ def assemble(listing: Listing, downscale: int | None = None, *, complete: bool =
         notes=tuple(notes),
     )
     return replace(scene, up=listing.up, notes=(*scene.notes, *listing.notes)), kept
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names for a message: all of them, or the first ones and how many more there are.
-
-    >>> listed(["a", "b"]), listed(["a"] * 22)[-15:]
-    ('a, b', 'a, a and 2 more')
-    """
-    shown = ", ".join(names[:MOST_NAMES])
-    return shown if len(names) <= MOST_NAMES else f"{shown} and {len(names) - MOST_NAMES} more"
 
 
 def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tuple[list[int], list[str]]:

@@ -14,10 +14,11 @@ from jaxtyping import Float, UInt8
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.data.pictures.bounds import are_inverted, estimate_bounds
+from hyperplanes.data.pictures.bounds import estimate_bounds, inverted
 from hyperplanes.data.pictures.images import check_downscale, composite_over_white, reduced
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.errors import listed
 from hyperplanes.utilities.files import DataError
 from hyperplanes.views import Task, Views
 
@@ -199,8 +200,9 @@ def posed(
             centre = bounds.centre
             bounds = Sphere((centre[0] - x, centre[1] - y, centre[2] - z), bounds.radius)
         notes = (*notes, f"the world is shifted: ({x:.10g}, {y:.10g}, {z:.10g}) is its new origin, for float32's sake")
-    if has_alpha and are_inverted(rgba[:, 3:]):
-        notes = (*notes, "masks cover the pictures' borders and not their middle: invert them, white is the object")
+    if has_alpha and (wrong := inverted(rgba[:, 3:]).nonzero()[:, 0].tolist()):
+        which = f"the masks of {len(wrong)} of {len(names)} pictures ({listed([names[index] for index in wrong])})"
+        notes = (*notes, f"{which} seem to show the background: invert them, white is the object")
     try:
         cameras = camera.pinhole(
             torch.from_numpy(intrinsics).float(), torch.from_numpy(camera_from_world).float(), height, width
