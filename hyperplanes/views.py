@@ -18,35 +18,9 @@ from hyperplanes.geometry.inputs import Selection, as_selection, check_channels_
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.utilities.arguments import checked, kind_of
+from hyperplanes.utilities.image_range import check_image_range
 
 __all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views", "moved"]
-
-
-MOST = 1.5
-"""Largest pixel value accepted as an image in [0, 1]; rendered values may overshoot slightly."""
-
-
-def check_values(name: str, values: object) -> None:
-    """Refuse pictures or masks that are not floating-point numbers in [0, 1].
-
-    Args:
-        name: of the argument.
-        values: what should be a tensor.
-
-    Raises:
-        ValueError: anything else, such as values from 0 to 255 or NaN.
-    """
-    if not isinstance(values, Tensor) or not values.is_floating_point():
-        found, hint = kind_of(values), "; torch.from_numpy(x).float() / 255 converts 8-bit pixels"
-        if isinstance(values, Tensor) and values.dtype == torch.bool:
-            hint = "; x.float() converts booleans"
-        raise ValueError(f"{name}: expected a tensor of floating-point numbers in [0, 1], got {found}{hint}")
-    if not values.numel() or values.is_meta:
-        return
-    low, high = (float(value) for value in values.detach().aminmax())
-    if not (1 - MOST <= low and high <= MOST):
-        hint = "divide 8-bit pixels by 255"
-        raise ValueError(f"{name}: expected finite numbers in [0, 1], got {low:g} to {high:g}; {hint}")
 
 
 @dataclass(frozen=True)
@@ -70,11 +44,11 @@ class Views:
     up: str | None = None
 
     def __post_init__(self) -> None:
-        check_values("images", self.images)
+        check_image_range("images", self.images)
         if not isinstance(self.cameras, PinholeCamera):
             raise ValueError(f"cameras: expected a PinholeCamera of Kornia, got {kind_of(self.cameras)}")
         if self.masks is not None:
-            check_values("masks", self.masks)
+            check_image_range("masks", self.masks)
         if self.images.ndim == 4 and len(self.images) and self.cameras.batch_size:
             check_channels_first("images", self.images, camera.image_size(self.cameras))
         if self.images.ndim != 4 or self.images.shape[1] != 3:

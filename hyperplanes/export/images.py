@@ -27,6 +27,7 @@ from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.encoding import encode_png
 from hyperplanes.utilities.errors import MissingPackageError
 from hyperplanes.utilities.files import format_of
+from hyperplanes.utilities.image_range import check_image_range
 from hyperplanes.utilities.writing import write_whole
 from hyperplanes.views import Views
 
@@ -151,8 +152,9 @@ def save_images(
             distinct.
 
     Returns:
-        The files. Another number of names is a ValueError.
+        The files. Another number of names, or values far outside [0, 1], are a ValueError.
     """
+    check_image_range("images", images)
     paths = picture_paths(len(images), Path(folder), names)
     for path, pixels in zip(paths, to_pixels(images), strict=True):
         write_whole(path, encode_png(pixels, small=True))

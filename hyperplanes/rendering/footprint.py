@@ -24,6 +24,7 @@ from hyperplanes.utilities.transforms import are_plain
 __all__ = ["footprint", "pixels_across"]
 
 
+@torch.no_grad()
 def pixels_across(cameras: PinholeCamera, bounds: Sphere) -> float:
     """The diameter of a sphere in pixels, in the view where it is largest; from inside, as seen from its surface."""
     camera.image_size(cameras)  # raises without cameras

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.image_range import check_image_range
 
 __all__ = ["foreground_psnr", "pooled_psnr", "psnr", "ssim"]
 
@@ -17,7 +18,7 @@ def psnr(
 ) -> Float[Tensor, " view"]:
     """Peak signal-to-noise ratio in dB of each image, both in [0, 1]: -10 log10 of the mean squared error.
 
-    Equal images give infinity, images of different shapes a ValueError.
+    Equal images give infinity. Images of different shapes, or a truth outside [0, 1], are a ValueError.
 
     >>> psnr(torch.full((1, 3, 4, 4), 0.6), torch.full((1, 3, 4, 4), 0.5)).round().tolist()
     [20.0]
@@ -32,7 +33,7 @@ def pooled_psnr(
 ) -> Float[Tensor, ""]:
     """PSNR in dB of the squared error of all images together; never above the mean of `psnr`.
 
-    Images of different shapes are a ValueError.
+    Images of different shapes, or a truth outside [0, 1], are a ValueError.
 
     >>> truth = torch.zeros(2, 3, 4, 4)
     >>> round(pooled_psnr(truth + torch.tensor([0.1, 0.0]).view(2, 1, 1, 1), truth).item(), 2)
@@ -53,7 +54,7 @@ def foreground_psnr(
     White background does not count, so the value does not depend on its area.
 
     Raises:
-        ValueError: images of different shapes, or masks of another size or number.
+        ValueError: images of different shapes, a truth outside [0, 1], or masks of another size or number.
 
     >>> truth, masks = torch.zeros(1, 3, 2, 2), torch.tensor([[[[1.0, 0.0], [0.0, 0.0]]]])
     >>> foreground_psnr(truth + torch.tensor([[0.1, 1.0], [1.0, 1.0]]), truth, masks).round(decimals=2).tolist()
@@ -77,7 +78,7 @@ def ssim(
     Equals scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)`.
 
     Raises:
-        ValueError: images of different shapes, or smaller than the window.
+        ValueError: images of different shapes or smaller than the window, or a truth outside [0, 1].
     """
     from kornia.metrics import ssim as kornia_ssim
 
@@ -88,8 +89,9 @@ def ssim(
 
 
 def _check(predicted: Tensor, truth: Tensor) -> None:
-    """Require equal shapes: others would be broadcast silently."""
+    """Require equal shapes, as others would be broadcast silently, and a truth in [0, 1]."""
     if predicted.shape != truth.shape:
         raise ValueError(
             f"predicted: expected the shape of the truth, {tuple(truth.shape)}, got {tuple(predicted.shape)}"
         )
+    check_image_range("truth", truth)

@@ -258,6 +258,10 @@ def test_images_are_written_as_they_are(tmp_path):
     assert [path.name for path in save_images(images, tmp_path, ("a/x.png", "b/x.png", "c"))][0] == "0000.png"
     with pytest.raises(ValueError, match="expected 3"):
         save_images(images, tmp_path, ("one",))
+    for wrong in (images * 255 + 2, images * torch.nan):
+        with pytest.raises(ValueError, match=r"images: expected finite numbers in \[0, 1\]"):
+            save_images(wrong, tmp_path / "wrong")
+    assert not (tmp_path / "wrong").exists()
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pipes that imageio-ffmpeg leaves open

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from hyperplanes.geometry.cameras import look_at, pinhole, select, to
+from hyperplanes.geometry.cameras import camera_from_world, look_at, pinhole, select, to, with_poses
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering import march
@@ -108,3 +108,9 @@ def test_cameras_in_double_precision():
 def test_no_cameras_are_refused():
     with pytest.raises(ValueError, match="cameras"):
         pixels_across(select(ring(2), []), Sphere())
+
+
+def test_cameras_that_require_gradients_give_the_same_number_without_a_warning():
+    cameras = ring(2)
+    free = with_poses(cameras, camera_from_world(cameras).clone().requires_grad_())
+    assert pixels_across(free, Sphere()) == pixels_across(cameras, Sphere())

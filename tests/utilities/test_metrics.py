@@ -106,3 +106,16 @@ def test_pictures_of_different_shapes_are_refused(measure):
 def test_masks_of_other_shapes_are_refused(shape):
     with pytest.raises(ValueError, match=r"masks: expected one an image, \(2, 1, 12, 12\), got"):
         foreground_psnr(torch.rand(2, 3, 12, 12), torch.rand(2, 3, 12, 12), torch.ones(shape))
+
+
+@pytest.mark.parametrize("metric", [psnr, pooled_psnr, ssim, lambda p, t: foreground_psnr(p, t, t[:, :1])])
+def test_images_of_0_to_255_are_refused(metric):
+    predicted, truth = pairs()
+    with pytest.raises(ValueError, match=r"truth: expected finite numbers in \[0, 1\], got 0 to .*divide 8-bit pixels"):
+        metric(predicted, truth * 255)
+
+
+def test_psnr_works_under_function_transforms():
+    predicted, truth = pairs()
+    single = torch.func.vmap(lambda p, t: psnr(p[None], t[None])[0])(predicted, truth)
+    torch.testing.assert_close(single, psnr(predicted, truth))
