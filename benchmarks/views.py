@@ -49,7 +49,7 @@ from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.adaptation.symmetry import ReflectedHullBlend
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data import open_dataset
-from hyperplanes.data.support import Inputs, Shown
+from hyperplanes.data.support import FewerQueries, Inputs, Shown
 from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.evaluation.comparison import compare
@@ -108,8 +108,7 @@ def main(arguments: list[str]) -> int:
     for suite, path, data, names, counts in opened:
         seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count: truth and prediction of every view
         for count in counts:
-            inputs = Inputs(data, tuple(chosen.inputs), chosen.query) if chosen.inputs else None
-            shown = _Rotated(inputs or Shown(data, count, chosen.query or QUERY), chosen.rotated)
+            shown = _Rotated(_tasks(data, count, chosen), chosen.rotated)
             steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
             made = seen.setdefault(count, [])
             about: Row = {"data": path.resolve().name, "views": count, "objects": len(names)}
@@ -129,6 +128,14 @@ def main(arguments: list[str]) -> int:
         sheet = [pad(row, (0, widest - row.shape[2]), value=1.0) for row in sheet]
         write_whole(chosen.pictures, encode_png(to_pixels(torch.cat(sheet, 1)[None])[0], small=True))
     return 0
+
+
+def _tasks(data: Tasks, count: int, chosen: argparse.Namespace) -> Tasks:
+    """The objects with the views of --inputs, or else with the `count` views that are farthest apart."""
+    if not chosen.inputs:
+        return Shown(data, count, chosen.query or QUERY)
+    inputs = Inputs(data, tuple(chosen.inputs))
+    return FewerQueries(inputs, chosen.query) if chosen.query else inputs
 
 
 def _opened(path: Path, chosen: argparse.Namespace) -> tuple[Tasks, list[str], list[int]]:

@@ -29,7 +29,7 @@ from small_demo import demo_folder, demo_preset, first_object, small_demo
 from small_packaged import small_packaged
 
 from data_gen.rendering.renderers import RendererError
-from hyperplanes.adaptation import HullBlend, HyperPlanes, ResidualField
+from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView, ResidualField
 from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
 from hyperplanes.cli import main
 from hyperplanes.commands import adapt, find_verbs, render
@@ -37,9 +37,10 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.scene import read_scene
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.configuration.presets import PRESETS
-from hyperplanes.data import DataError, read_task
+from hyperplanes.data import DataError, open_dataset, read_task
 from hyperplanes.data.dataset import locate_scene
-from hyperplanes.evaluation import suitability
+from hyperplanes.data.support import FewerQueries, Inputs, WithSupport
+from hyperplanes.evaluation import evaluate, suitability
 from hyperplanes.export.baking import BakedScene
 from hyperplanes.export.images import to_pixels
 from hyperplanes.fields.baked import BakedField
@@ -688,6 +689,47 @@ def test_adapt_names_the_command_that_shows_its_weights_the_same_views(given, tm
     assert [f"--{name.replace('_', '-')}" for name, value in taken.items() if value] == ([] if up else given)
 
 
+def test_the_views_that_evaluate_gives_to_methods(tmp_path, capsys):
+    """Source of truth: the same wrappers of the data set in Python."""
+    data, result = open_dataset(demo_folder() / "data"), tmp_path / "table.json"
+    names = data.names("test")
+
+    def measured(*options):
+        command = ["evaluate", "--data", str(demo_folder() / "data"), "--method", "nearest_view", "--json", str(result)]
+        assert main([*command, *options]) == 0
+        return json.loads(result.read_text())["nearest_view"]
+
+    def expected(tasks):
+        return evaluate("nearest_view", NearestView(), tasks, names).mean("psnr")
+
+    farthest = measured("--support", "2", "--choose", "farthest")
+    assert farthest["psnr"] == pytest.approx(expected(WithSupport(data, 2, "farthest")))
+    draws = measured("--support", "2", "--choose", "random", "--seeds", "2")
+    assert "choices of support views" in capsys.readouterr().out
+    by_seed = [expected(WithSupport(data, 2, "random", seed)) for seed in range(2)]
+    assert [run["psnr"] for run in draws["seeds"]] == pytest.approx(by_seed)
+    assert by_seed[0] != by_seed[1]
+    placed = measured("--inputs", "1", "4", "--query", "2")
+    assert placed["psnr"] == pytest.approx(expected(FewerQueries(Inputs(data, (1, 4)), 2)))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--choose", "random"], "--choose random: expected --support N with it"),
+        (["--inputs", "1", "--support", "2"], "--inputs: expected neither --support nor --choose with it"),
+        (["--query", "0"], "--query: expected at least 1, got 0"),
+        (["--inputs", "999"], "expected inputs from 0 to"),
+        (["--method", "hyperplanes@"], "--method: expected a checkpoint after @, got hyperplanes@"),
+        (["--method", "hyperplanes@smal"], "smal: expected a checkpoint's folder or the name of a packaged model"),
+    ],
+)
+def test_views_and_checkpoints_that_evaluate_cannot_take(options, message, capsys):
+    methods = [] if "--method" in options else ["--method", "nearest_view"]
+    assert main(["evaluate", "--data", "example-car", *methods, *options]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_seeds_of_trainings_and_of_gradient_steps_in_every_kind_of_file(tmp_path, capsys):
     """Source of truth: the evaluation of each checkpoint alone, and arithmetic."""
     demo, data = demo_folder(), ["--data", str(demo_folder() / "data")]
@@ -701,13 +743,20 @@ def test_seeds_of_trainings_and_of_gradient_steps_in_every_kind_of_file(tmp_path
     methods = ["--method", "nearest_view", "hyperplanes", "hyperplanes_2"]
     seeded = ["--checkpoint", str(tmp_path / "run-{seed}"), "--seeds", "2"]
     assert main(["evaluate", *data, *methods, *seeded, *files]) == 0
-    assert "± is the standard deviation over 2 seeds of trainings" in capsys.readouterr().out
+    over = "over 2 seeds (of trainings, gradient steps, random weights)"
+    assert f"± is the standard deviation {over}" in capsys.readouterr().out
     table = json.loads((tmp_path / "table.json").read_text())
     single = []
     for seed in (0, 1):
         alone = ["--checkpoint", str(tmp_path / f"run-{seed}"), "--method", "hyperplanes"]
         assert main(["evaluate", *data, *alone, "--json", str(tmp_path / "one.json")]) == 0
         single.append(json.loads((tmp_path / "one.json").read_text())["hyperplanes"]["psnr"])
+    both = [f"hyperplanes@{tmp_path / run}" for run in ("run-0", "run-1")]
+    assert main(["evaluate", *data, "--method", *both, "--json", str(tmp_path / "both.json")]) == 0
+    side_by_side = json.loads((tmp_path / "both.json").read_text())
+    assert {row: side_by_side[row]["psnr"] for row in both} == pytest.approx(
+        dict(zip(both, single, strict=True)), abs=1e-4
+    )
     assert table["hyperplanes"]["psnr"] == pytest.approx(sum(single) / 2, abs=1e-4)
     assert table["hyperplanes"]["deviation"]["psnr"] == pytest.approx(abs(single[0] - single[1]) / 2**0.5, abs=1e-4)
     assert table["nearest_view"]["deviation"]["psnr"] == 0

@@ -1,22 +1,26 @@
 """Compare methods on objects that none of them was trained on: PSNR and SSIM over the query views, as one table.
 
-Every method goes through the same code: it is shown the support views of an object and judged by the others. The data
-set may be one that `generate` wrote or a single posed scene, such as a folder with transforms.json.
+Every method runs through the same code: it gets the support views of an object, and its pictures of the query views are
+compared with the images. The data set may be one that `generate` wrote or a single posed scene, such as a folder with
+transforms.json.
 
-A method's name may end in a number of fine-tuning steps on the support views of each object, or in _auto. With --steps
-every method that can be fine-tuned is evaluated at each of those numbers, and --curve draws its PSNR over them.
+A method's name may end in a number of fine-tuning steps on the support views of each object, or in _auto. With --steps,
+every method that can be fine-tuned is evaluated at each of those numbers, and --curve draws its PSNR over them. A name
+may be followed by @ and a checkpoint, to compare several checkpoints of one method in one table.
 
 With --seeds N everything is done N times with the seeds 0 to N - 1, and the table has means and standard deviations
-over them. A seed is that of gradient steps on the support views and of random weights; where a --checkpoint has {seed}
-in its name, it is that of the training, too. Methods are compared in pairs over the objects, by a paired t-test.
+over them. The seed determines gradient steps on the support views, random weights, and the support views of --choose
+random; {seed} in the name of a checkpoint stands for it. Methods are compared in pairs over the objects, by a paired
+t-test.
 
-Objects that cannot be read or adapted to are named and left out, for all methods, and the exit code is 1. What has been
-measured stands in NAME.partial.json until the NAME.json of --json is whole.
+Objects that cannot be read or adapted to are named and left out, for all methods, and the exit code is 1. While the
+command runs, NAME.partial.json has the results so far; at the end, NAME.json of --json has all of them.
 
 Example:
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method nearest_view hyperplanes hyperplanes_swapped
     hyperplanes evaluate --data data/cars --checkpoint runs/cars --method hyperplanes scratch --steps 10 100
-    hyperplanes evaluate --data scene --checkpoint runs/demo --method hyperplanes --json scene.json
+    hyperplanes evaluate --data data/cars --method hull_blend hyperplanes@small hyperplanes@runs/cars
+    hyperplanes evaluate --data data/cars --checkpoint small --support 3 --choose random --seeds 5
     hyperplanes evaluate --data data/cars --checkpoint runs/cars-{seed} --seeds 5 --markdown cars.md --boxes cars.png
     hyperplanes evaluate --data scene --method nearest_view hull_blend point_multiplane_scratch_300
 """
@@ -44,7 +48,7 @@ __all__ = ["Arguments", "run", "with_seed"]
 BROUGHT = {"Methods": "hyperplanes.methods", "Fields": "hyperplanes.fields"}
 """Groups of entry points whose names are methods."""
 
-SEED = "{seed}"
+SEED, AT = "{seed}", "@"
 LARGEST_TABLE = 12  # pairs shown in the terminal; all are in the files
 
 
@@ -59,9 +63,9 @@ class Arguments:
             autoencoder; scratch_N (the field of a checkpoint from random weights), nerf_scratch_N,
             multiplane_scratch_N, point_multiplane_scratch_N (no checkpoint is needed); standard, mv_matched,
             mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but the first three and hyperplanes_swapped may
-            be followed by _N or _auto for gradient steps.
-        checkpoint: Folders that `train` wrote, folders of them such as runs/demo, or a packaged model: small,
-            small-paper, cars-64; {seed} stands for each seed.
+            be followed by _N or _auto for gradient steps. @CHECKPOINT after a name is the checkpoint of this row.
+        checkpoint: The checkpoints of names without @: folders that `train` wrote, folders of them such as runs/demo,
+            or a packaged model: small, small-paper, cars-64; {seed} stands for each seed.
         json: Write the table here too, with every object, every seed and every pair of methods.
         csv: Write every object's numbers here, a line each.
         markdown: Write the tables of methods and of their pairs here.
@@ -74,8 +78,13 @@ class Arguments:
         lpips: Measure LPIPS with these weights, a safetensors file that `hyperplanes.evaluation.perceptual` describes.
         split: Which objects.
         objects: Evaluate only the first N objects.
-        support: Support views an object, the first ones of the data set. If it has fewer, query views are added, which
-            are then compared although they were shown; a warning says so.
+        support: Number of support views of each object; by default all. If an object has fewer, query views are added,
+            which are then compared although they were given; a warning says so.
+        choose: Which views --support takes: the first ones of the data set, those whose cameras are farthest apart, or
+            a random choice for each object and seed.
+        inputs: Places of the support views in the order of the views' names, from 0, such as 64 128 for SRN's protocol.
+            All other views are query views.
+        query: Compare only this number of query views of each object, evenly chosen.
         preset: The shape of fields that need no checkpoint.
         up: The direction that points up in the data's world: an axis such as y or -z, three numbers such as 0,0.1,1, or
             auto: of a single scene, from how its cameras are held; of a data set, as its files say, otherwise y as in
@@ -102,6 +111,9 @@ class Arguments:
     split: Literal["test", "val", "train", "all"] = "test"
     objects: OptionalInt = None
     support: OptionalInt = None
+    choose: Literal["first", "farthest", "random"] = "first"
+    inputs: tuple[int, ...] = ()
+    query: OptionalInt = None
     preset: str = "quick"
     up: ViewsUp = "auto"
     protocol: Protocol = "default"
@@ -118,6 +130,22 @@ def with_seed(folders: Sequence[Path], seed: int) -> list[Path]:
     return [Path(str(folder).replace(SEED, str(seed))) for folder in folders]
 
 
+def rows_of(method: str, steps: Sequence[int]) -> list[str]:
+    """The rows of one name of --method: with each of several numbers of gradient steps, and with its checkpoint.
+
+    >>> rows_of("hyperplanes@runs/cars", [0, 10])
+    ['hyperplanes@runs/cars', 'hyperplanes_10@runs/cars']
+
+    Args:
+        method: the name, with @ and a checkpoint after it or without.
+        steps: as in `methods.at_steps`.
+    """
+    from hyperplanes.methods import at_steps
+
+    name, at, checkpoint = method.partition(AT)
+    return [f"{each}{at}{checkpoint}" for each in at_steps(name, steps)]
+
+
 def run(arguments: Arguments) -> int:
     """Evaluate all methods, print the table and write what was asked for."""
     from hyperplanes.adaptation.checkpoints import find_checkpoints
@@ -126,53 +154,35 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data import open_dataset
     from hyperplanes.data.devices import TasksOnDevice, choose_device
-    from hyperplanes.data.support import WithSupport
     from hyperplanes.evaluation import evaluate_all
     from hyperplanes.evaluation.comparison import compare_all
     from hyperplanes.evaluation.figures import PictureGrid
     from hyperplanes.evaluation.partial_results import PartialResults
     from hyperplanes.evaluation.perceptual import LPIPS
     from hyperplanes.evaluation.tables import PAIR_HEADINGS, compared_rows, headings, rows
-    from hyperplanes.methods import Request, WithSampler, at_steps, make_method
+    from hyperplanes.methods import Request, WithSampler, make_method
     from hyperplanes.utilities.errors import listed
-    from hyperplanes.utilities.plots import figure_kind
 
-    if not arguments.method:
-        raise ValueError("--method: expected at least one, got none")
-    if arguments.curve is not None and len(arguments.steps) < 2:
-        raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
-    if (fewest := min(arguments.steps, default=0)) < 0:
-        raise ValueError(f"--steps: expected 0 or more, got {fewest}")
-    for name in arguments.method:
-        if not at_steps(name, arguments.steps):
-            raise ValueError(f"--steps: expected a number of at least 1 for {name}, got 0")
-    for figure in (arguments.curve, arguments.boxes, arguments.grid):
-        if figure is not None:
-            figure_kind(figure)  # a wrong name is found before anything is evaluated
-    for option in OUTPUTS:
-        check_output(option, getattr(arguments, option))
-    if arguments.seeds < 1:
-        raise ValueError(f"--seeds: expected at least 1, got {arguments.seeds}")
+    _check(arguments)
     console, device = Console(), choose_device(arguments.device)
     checkpoints = [find_checkpoints(with_seed(arguments.checkpoint, seed)) for seed in range(arguments.seeds)]
     opened = open_dataset(arguments.data, legacy=arguments.legacy)
     for line in opened.skipped:
         console.warn(line)
-    tasks = opened if arguments.support is None else WithSupport(opened, arguments.support)
-    data = TasksOnDevice(tasks, device, _up(arguments, opened, console))
-    names = data.names(arguments.split)[: arguments.objects]
-    if arguments.objects is not None and arguments.objects < 1:
-        raise ValueError(f"--objects: expected at least 1, got {arguments.objects}")
+    up = _up(arguments, opened, console)
+    data = [TasksOnDevice(_tasks(arguments, opened, seed), device, up) for seed in range(arguments.seeds)]
+    names = opened.names(arguments.split)[: arguments.objects]
     if not names:
         raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
     sampling = PROTOCOLS[arguments.protocol]
     lpips = None if arguments.lpips is None else LPIPS(arguments.lpips, device)
 
-    def make(name: str, seed: int) -> WithSampler:
-        objects = _supports(data, names)
+    def make(row: str, seed: int) -> WithSampler:
+        name, _, folder = row.partition(AT)
+        objects = _supports(data[seed], names)
         request = Request(
             name,
-            checkpoints[seed],
+            find_checkpoints(with_seed([Path(folder)], seed)) if folder else checkpoints[seed],
             device=device,
             settings=FineTuning(trainable=arguments.fine_tune, seed=seed),
             objects=objects,
@@ -181,7 +191,7 @@ def run(arguments: Arguments) -> int:
         )
         return WithSampler(make_method(request), sampling)
 
-    chosen = list(dict.fromkeys(each for name in arguments.method for each in at_steps(name, arguments.steps)))
+    chosen = list(dict.fromkeys(row for name in arguments.method for row in rows_of(name, arguments.steps)))
     first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to
     check_fine_tune(arguments.fine_tune, sum(isinstance(made.adapter, FineTuned) for made in first.values()))
     pictures, failures, kept = PictureGrid(), {}, PartialResults(arguments.json)
@@ -227,6 +237,47 @@ def run(arguments: Arguments) -> int:
     return int(bool(failures))
 
 
+def _check(arguments: Arguments) -> None:
+    """Refuse wrong options before anything is read."""
+    from hyperplanes.utilities.plots import figure_kind
+
+    if not arguments.method:
+        raise ValueError("--method: expected at least one, got none")
+    if arguments.curve is not None and len(arguments.steps) < 2:
+        raise ValueError(f"--curve: expected at least two numbers of --steps to draw, got {len(arguments.steps)}")
+    if (fewest := min(arguments.steps, default=0)) < 0:
+        raise ValueError(f"--steps: expected 0 or more, got {fewest}")
+    for name in arguments.method:
+        if not rows_of(name, arguments.steps):
+            raise ValueError(f"--steps: expected a number of at least 1 for {name}, got 0")
+        if name.endswith(AT):
+            raise ValueError(f"--method: expected a checkpoint after {AT}, got {name}")
+    for figure in (arguments.curve, arguments.boxes, arguments.grid):
+        if figure is not None:
+            figure_kind(figure)  # a wrong name is found before anything is evaluated
+    for option in OUTPUTS:
+        check_output(option, getattr(arguments, option))
+    for option in ("seeds", "objects", "support", "query"):
+        if (number := getattr(arguments, option)) is not None and number < 1:
+            raise ValueError(f"--{option}: expected at least 1, got {number}")
+    if arguments.inputs and (arguments.support is not None or arguments.choose != "first"):
+        raise ValueError("--inputs: expected neither --support nor --choose with it, as it states the support views")
+    if arguments.support is None and arguments.choose != "first":
+        raise ValueError(f"--choose {arguments.choose}: expected --support N with it, got none")
+
+
+def _tasks(arguments: Arguments, opened: Dataset, seed: int) -> Tasks:
+    """The objects with the requested support and query views."""
+    from hyperplanes.data.support import FewerQueries, Inputs, WithSupport
+
+    tasks: Tasks = opened
+    if arguments.inputs:
+        tasks = Inputs(opened, arguments.inputs)
+    elif arguments.support is not None:
+        tasks = WithSupport(opened, arguments.support, arguments.choose, seed)
+    return tasks if arguments.query is None else FewerQueries(tasks, arguments.query)
+
+
 def _supports(data: Tasks, names: Sequence[str]) -> Iterator[Views]:
     """The support views of the objects that can be read; the others are named when they are evaluated."""
     for name in names:
@@ -250,13 +301,13 @@ def _up(arguments: Arguments, data: Dataset, console: Console) -> str | None:
 
 
 def _of_seeds(arguments: Arguments) -> str:
+    """The meaning of ± in the table; empty for one seed."""
     if arguments.seeds == 1:
         return ""
-    trained = any(SEED in str(folder) for folder in arguments.checkpoint)
-    what = (
-        "of trainings and of gradient steps" if trained else "of gradient steps and random weights, the same training"
-    )
-    return f"; ± is the standard deviation over {arguments.seeds} seeds {what}"
+    named = [*map(str, arguments.checkpoint), *arguments.method]
+    varied = ["trainings", "gradient steps"] if any(SEED in each for each in named) else ["gradient steps"]
+    varied += ["random weights", *(["choices of support views"] if arguments.choose == "random" else [])]
+    return f"; ± is the standard deviation over {arguments.seeds} seeds (of {', '.join(varied)})"
 
 
 def _of_shown(scores: Sequence[Score]) -> str:
@@ -273,7 +324,6 @@ def _of_shown(scores: Sequence[Score]) -> str:
 def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Comparison]) -> None:
     """Every file but the grid of pictures."""
     from hyperplanes.evaluation import figures, tables
-    from hyperplanes.methods import at_steps
     from hyperplanes.utilities.writing import write_json, write_whole
 
     if arguments.json is not None:
@@ -292,7 +342,7 @@ def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Compar
             method: [
                 (float(count), quality[name])
                 for count in arguments.steps
-                for name in at_steps(method, [count])
+                for name in rows_of(method, [count])
                 if name in quality  # it failed on every object
             ]
             for method in arguments.method

@@ -1,18 +1,22 @@
-"""Tasks with other support views: more or fewer of them, or a single one; or with a sphere that files do not state."""
+"""Tasks with other support or query views than their data set states, or with a sphere that its files do not state."""
 
 from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
+from torch import Tensor
 
 from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, join_views
 
-__all__ = ["Inputs", "Shown", "SingleView", "WithBounds", "WithSupport"]
+__all__ = ["Choice", "FewerQueries", "Inputs", "Shown", "SingleView", "WithBounds", "WithSupport"]
+
+Choice = Literal["first", "farthest", "random"]
 
 
 @dataclass(frozen=True)
@@ -25,9 +29,14 @@ class WithSupport(TaskWrapper):
 
     Attributes:
         count: support views of every object.
+        choose: which of an object's support views, if there are fewer than it has: the first ones; those whose cameras
+            are farthest apart, beginning with the first view; or a random choice, another one for every object.
+        seed: of random choices.
     """
 
     count: int
+    choose: Choice = "first"
+    seed: int = 0
 
     def __post_init__(self) -> None:
         if self.count < 1:
@@ -42,8 +51,17 @@ class WithSupport(TaskWrapper):
                 f"--support {total} takes all of them"
             )
         more = self.count - len(task.support)
-        support = task.support[: self.count] if more <= 0 else join_views(task.support, task.query[:more])
+        support = task.support[self._chosen(task)] if more <= 0 else join_views(task.support, task.query[:more])
         return replace(task, support=support)
+
+    def _chosen(self, task: Task) -> Tensor:
+        """Indices of the chosen support views."""
+        if self.choose == "farthest":
+            return torch.tensor(farthest_first(task.support.camera_directions, 0, self.count))
+        if self.choose == "random":
+            generator = torch.Generator().manual_seed(zlib.crc32(f"{self.seed} {task.name}".encode()))
+            return torch.randperm(len(task.support), generator=generator)[: self.count]
+        return torch.arange(self.count)
 
 
 @dataclass(frozen=True)
@@ -73,6 +91,25 @@ class WithBounds(TaskWrapper):
 
 
 @dataclass(frozen=True)
+class FewerQueries(TaskWrapper):
+    """Tasks with fewer query views, evenly chosen.
+
+    Attributes:
+        count: query views of every object; objects that have fewer keep all.
+    """
+
+    count: int
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ValueError(f"query: expected at least 1 view, got {self.count}")
+
+    def change(self, task: Task) -> Task:
+        """The task with at most `count` query views."""
+        return replace(task, query=task.query[_evenly(self.count, len(task.query))])
+
+
+@dataclass(frozen=True)
 class Shown(TaskWrapper):
     """Tasks of which some views are shown, those that stand farthest apart, and some query views are kept back.
 
@@ -86,7 +123,7 @@ class Shown(TaskWrapper):
 
     def change(self, task: Task) -> Task:
         """The task with the views that are farthest apart, the first one first."""
-        asked = torch.linspace(0, len(task.query) - 1, min(self.query, len(task.query))).round().long()
+        asked = _evenly(self.query, len(task.query))
         rest = [index for index in range(len(task.query)) if index not in asked.tolist()]
         views = join_views(task.support, task.query[rest])
         chosen = farthest_first(views.camera_directions, 0, min(self.count, len(views)))
@@ -101,11 +138,9 @@ class Inputs(TaskWrapper):
 
     Attributes:
         places: of the support views, from 0.
-        query: how many of the others are query views, evenly chosen; all where None.
     """
 
     places: tuple[int, ...]
-    query: int | None = None
 
     def change(self, task: Task) -> Task:
         """The task with these support views; ValueError where the object has no such view."""
@@ -115,5 +150,9 @@ class Inputs(TaskWrapper):
             raise ValueError(f"{task.name}: expected inputs from 0 to {len(views) - 1}, got {self.places}")
         inputs = [order[place] for place in self.places]
         rest = [index for index in order if index not in inputs]
-        asked = torch.linspace(0, len(rest) - 1, min(self.query or len(rest), len(rest))).round().long()
-        return replace(task, support=views[inputs], query=views[[rest[index] for index in asked]])
+        return replace(task, support=views[inputs], query=views[rest])
+
+
+def _evenly(count: int, total: int) -> Tensor:
+    """Indices of `count` of `total` views, evenly spaced; of all where there are fewer."""
+    return torch.linspace(0, total - 1, min(count, total)).round().long()

@@ -230,7 +230,7 @@ def _evaluate_one(
 
 def evaluate_all(
     methods: Mapping[str, Callable[[int], Adapter]],
-    data: Tasks,
+    data: Tasks | Sequence[Tasks],
     names: Sequence[str],
     report: Callable[[int, int, str], None],
     *,
@@ -244,7 +244,7 @@ def evaluate_all(
 
     Args:
         methods: by the names of their rows, each a function of the seed.
-        data: where the objects are.
+        data: where the objects are; a sequence has the tasks of each seed, such as other choices of support views.
         names: the objects.
         report: called with (evaluations done, evaluations in all, what has just been found) after each.
         seeds: how many, from 0.
@@ -260,6 +260,7 @@ def evaluate_all(
         everything failed.
     """
     done, found, errors = 0, {}, []
+    by_seed = data if isinstance(data, Sequence) else [data] * seeds
 
     def failed(method: str, seed: int, name: str, error: Exception) -> None:
         nonlocal done
@@ -281,7 +282,7 @@ def evaluate_all(
         runs = []
         for seed in range(seeds):
             look, fail = partial(seen, method, seed), partial(failed, method, seed)
-            runs.append(evaluate(method, make(seed), data, names, look, lpips, fail if on_failure else None))
+            runs.append(evaluate(method, make(seed), by_seed[seed], names, look, lpips, fail if on_failure else None))
         found[method] = runs
     if len(errors) == done:
         raise errors[0]

@@ -7,7 +7,7 @@ import torch
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data.devices import TasksOnDevice
-from hyperplanes.data.support import Inputs, Shown, SingleView, WithBounds, WithSupport
+from hyperplanes.data.support import FewerQueries, Inputs, Shown, SingleView, WithBounds, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
@@ -92,9 +92,43 @@ def test_inputs_are_counted_in_the_order_of_their_names(named):
     for got, (views, place) in zip(after.support.images, expected, strict=True):
         assert torch.equal(got, views.images[place])
     assert len(after.query) == 6
-    assert len(Inputs(Alternating(), (0, 3), 2).task("test0").query) == 2
     with pytest.raises(ValueError, match="test0: expected inputs from 0 to 7, got"):
         Inputs(Alternating(), (8,)).task("test0")
+
+
+def test_the_support_can_be_the_views_that_are_farthest_apart():
+    data = Balls(views=12)
+    directions = data.task("test0").support.camera_directions
+    chosen = WithSupport(data, 2, "farthest").task("test0").support.camera_directions
+    assert torch.equal(chosen[0], directions[0])
+    assert torch.equal(chosen[1], directions[(directions @ directions[0]).argmin()])
+
+
+def test_random_support_views_are_distinct_and_depend_on_the_seed_and_the_object():
+    data = Balls(views=12)
+
+    def drawn(name, seed):
+        support = WithSupport(data, 4, "random", seed).task(name).support
+        every = centres(data.task(name).support.cameras)
+        return [int((every == centre).all(1).nonzero()) for centre in centres(support.cameras)]
+
+    assert drawn("test0", 0) == drawn("test0", 0)
+    draws = [drawn("test0", seed) for seed in range(40)]
+    assert all(len(set(draw)) == 4 for draw in draws)
+    assert {index for draw in draws for index in draw} == set(range(12)), "40 draws of 4 in 12 miss one by 12 (2/3)^40"
+    assert drawn("test0", 0) != drawn("test1", 0)
+    whole = WithSupport(data, 14, "random").task("test0").support
+    assert torch.equal(whole.images, WithSupport(data, 14).task("test0").support.images)
+
+
+def test_query_views_are_left_out_evenly():
+    data = Balls(views=9)
+    before, after = data.task("test0"), FewerQueries(data, 3).task("test0")
+    assert torch.equal(after.query.images, before.query.images[[0, 4, 8]])
+    assert torch.equal(after.support.images, before.support.images)
+    assert len(FewerQueries(data, 20).task("test0").query) == 9
+    with pytest.raises(ValueError, match="query: expected at least 1 view, got 0"):
+        FewerQueries(data, 0)
 
 
 def test_every_wrapper_keeps_splits_and_classes():
@@ -108,6 +142,7 @@ def test_every_wrapper_keeps_splits_and_classes():
         SingleView(data),
         Shown(data, 2, 1),
         Inputs(data, (0,)),
+        FewerQueries(data, 1),
         TasksOnDevice(data, torch.device("cpu")),
     ):
         assert wrapped.names("train") == data.names("train")
