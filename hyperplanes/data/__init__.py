@@ -1,4 +1,4 @@
-"""Files to views: data sets and posed images of many layouts in, few-shot tasks out."""
+"""Readers of data sets and posed images in many layouts, which return views and few-shot tasks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HOMES |= {"read_task": "dataset", "read_views": "dataset"}
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for, so that writing files needs no torch."""
+    """Import a public name at its first use, so that writing files does not import torch."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
