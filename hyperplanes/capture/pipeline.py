@@ -346,7 +346,7 @@ def _placed(
         own = [opacity is not None for opacity in given]
         pictures = None if all(own) or not is_installed("cv2") else straight
         found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius), pictures)
-        for kept, done in ((True, "look at them"), (False, "they were mended by what these show together")):
+        for kept, done in ((True, "check them"), (False, "they were corrected by what the others show")):
             if names := [photographs[row].name for row in found.wrong if own[row] == kept]:
                 work.notes.append(f"{len(names)} masks contradict the others, {done}: {listed(names)}")
         work.progress("agreement", 1, 1, f"{1 - float(found.disagreement.mean()):.1%} of their area")

@@ -192,14 +192,14 @@ def _match(pycolmap: Any, pictures: Sequence[Picture], database: Path, sequentia
     left = [pair for pair in pairs if pycolmap.image_pair_to_pair_id(*(number[name] for name in pair)) not in done]
     listed = database.with_suffix(".pairs.txt")
     for start in range(0, len(left), PAIRS_AT_ONCE):
-        progress("matches", len(pairs) - len(left) + start, len(pairs), "pairs of pictures")
+        progress("matches", len(pairs) - len(left) + start, len(pairs), "pairs of images")
         chunk = left[start : start + PAIRS_AT_ONCE]
         write_whole(listed, "\n".join(f"{first} {second}" for first, second in chunk).encode(), durable=False)
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = listed
         pycolmap.match_image_pairs(database, options, pairing, device=pycolmap.Device.cpu)
     listed.unlink(missing_ok=True)
-    progress("matches", len(pairs), len(pairs), "pairs of pictures")
+    progress("matches", len(pairs), len(pairs), "pairs of images")
 
 
 def _map(pycolmap: Any, count: int, folder: Path, database: Path, progress: Progress) -> list[Any]:
@@ -214,12 +214,12 @@ def _map(pycolmap: Any, count: int, folder: Path, database: Path, progress: Prog
     def start() -> None:
         nonlocal registered
         registered = 2
-        progress("poses", registered, count, "pictures registered")
+        progress("poses", registered, count, "images registered")
 
     def step() -> None:
         nonlocal registered
         registered = min(registered + 1, count)
-        progress("poses", registered, count, "pictures registered")
+        progress("poses", registered, count, "images registered")
 
     out = database.with_suffix(".models")
     out.mkdir(exist_ok=True)

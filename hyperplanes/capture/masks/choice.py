@@ -37,7 +37,7 @@ def check_mask(name: str) -> None:
     if name == "network":
         SalientObject()
     elif name == "grabcut":
-        require("cv2", "cuts masks out of pictures")
+        require("cv2", "finds masks by GrabCut")
     elif name not in MASKS:
         if " " not in name and "{" not in name:
             raise ValueError(f"--mask: expected one of {', '.join(MASKS)}, or a command, got {name!r}")

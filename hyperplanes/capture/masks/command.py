@@ -72,5 +72,5 @@ class Command:
         if opacity.shape != picture.shape[:2]:
             found = f"{opacity.shape[1]} x {opacity.shape[0]}"
             size = f"{picture.shape[1]} x {picture.shape[0]} pixels"
-            raise DataError("--mask", f"a mask of {size}, as the picture", found, "correct the command")
+            raise DataError("--mask", f"a mask of {size}, as the image", found, "correct the command")
         return opacity / 255.0

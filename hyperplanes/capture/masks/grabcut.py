@@ -31,7 +31,7 @@ class GrabCut:
     """
 
     def __init__(self, model: SparseModel) -> None:
-        self._cv2 = require("cv2", "cuts masks out of pictures")
+        self._cv2 = require("cv2", "finds masks by GrabCut")
         self._model = model
         self._chosen = object_points(model, None)
         self._sphere = object_sphere(model, self._chosen)
@@ -83,11 +83,11 @@ def extended(
     """
     cv2 = require("cv2", "completes masks by colour")
     size, _ = _reduced_size(picture)
-    likely, room = (np.asarray(_resized(values, size) > 0.5) for values in (mask, possible))
+    likely, allowed = (np.asarray(_resized(values, size) > 0.5) for values in (mask, possible))
     depth = max(1, round(CERTAIN * float(np.sqrt(likely.sum()))))
     certain = np.asarray(ndimage.binary_erosion(likely, iterations=depth), bool)
     labels = np.full(certain.shape, cv2.GC_BGD)
-    for where, label in ((room, cv2.GC_PR_BGD), (likely, cv2.GC_PR_FGD), (certain, cv2.GC_FGD)):
+    for where, label in ((allowed, cv2.GC_PR_BGD), (likely, cv2.GC_PR_FGD), (certain, cv2.GC_FGD)):
         labels[where] = label
     if not (certain.any() and (labels == cv2.GC_PR_BGD).any()):
         return mask
@@ -96,7 +96,7 @@ def extended(
 
 def _cut(picture: np.ndarray, labels: np.ndarray, steps: int = STEPS) -> np.ndarray:
     """Opacity of the image by GrabCut, from initial labels in a lower resolution."""
-    cv2 = require("cv2", "cuts masks out of pictures")
+    cv2 = require("cv2", "finds masks by GrabCut")
     small = np.asarray(Image.fromarray(picture).resize(labels.shape[::-1], Image.Resampling.BOX))
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))

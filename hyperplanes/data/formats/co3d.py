@@ -102,7 +102,7 @@ def _splits(path: Path) -> dict[str, str]:
     for split in ("val", "test", "train"):
         for entry in document.get(split) or ():
             if not (isinstance(entry, list) and entry and isinstance(entry[0], str)):
-                raise DataError(path, f"(sequence, frame, picture) in {split}", repr(entry)[:60], _REMEDY)
+                raise DataError(path, f"(sequence, frame, image) in {split}", repr(entry)[:60], _REMEDY)
             result[entry[0]] = split
     return result
 

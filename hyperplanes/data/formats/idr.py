@@ -51,7 +51,7 @@ def read_idr(folder: Path, root: Path) -> Listing:
     if not pictures or count != len(pictures):
         more = " or more" if count > len(pictures) else ""
         raise DataError(
-            source, f"{count}{more} pictures, one a world_mat", f"{len(pictures)} in {home}", "copy all pictures"
+            source, f"{count}{more} images, one per world_mat", f"{len(pictures)} in {home}", "copy all images"
         )
     masks = find_masks([folder / "mask", folder / "masks"], pictures, root)
     frames = []

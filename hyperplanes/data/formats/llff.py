@@ -96,4 +96,4 @@ def _pictures(folder: Path, count: int, root: Path) -> list[Path]:
             return files
         found[home.name] = len(files)
     text = ", ".join(f"{number} in {name}" for name, number in found.items()) or "no folder images"
-    raise DataError(folder / FILE, f"{count} pictures, one a row", text, "copy all pictures to images/")
+    raise DataError(folder / FILE, f"{count} images, one per row", text, "copy all images to images/")

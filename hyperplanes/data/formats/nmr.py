@@ -56,7 +56,7 @@ def read_nmr(folder: Path, root: Path) -> Listing:
     source = folder / "cameras.npz"
     pictures = list_files(folder / "image", PICTURE_SUFFIXES, root)
     if not pictures:
-        raise DataError(folder / "image", "pictures", "none", "download the object again")
+        raise DataError(folder / "image", "images", "none", "download the object again")
     wanted = {f"{kind}_{index}" for kind in ("world_mat", "camera_mat") for index in range(len(pictures))}
     arrays = read_arrays(source, wanted, root)
     masks = find_masks([folder / "mask"], pictures, root)

@@ -45,7 +45,7 @@ def read_nsvf(folder: Path, root: Path) -> Listing:
     """
     pictures = list_files(folder / "rgb", PICTURE_SUFFIXES, root)
     if not pictures:
-        raise DataError(folder / "rgb", "pictures", "none", _REMEDY)
+        raise DataError(folder / "rgb", "images", "none", _REMEDY)
     matrix, size = _intrinsics(folder / "intrinsics.txt", root)
     calibrate = (lambda _: matrix) if size is None else partial(scaled_matrix, matrix, size)
     frames = []

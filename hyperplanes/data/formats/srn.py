@@ -48,7 +48,7 @@ def read_srn(folder: Path, root: Path, bounds: Sphere | None = None) -> Posed:
     """
     pictures = list_files(folder / "rgb", _SUFFIXES, root)
     if not pictures:
-        raise DataError(folder / "rgb", "pictures", "none", "download the object again")
+        raise DataError(folder / "rgb", "images", "none", "download the object again")
     poses = [folder / "pose" / f"{path.stem}.txt" for path in pictures]
     size = image_size(pictures[0])
     pixels = [read_image(path, size) for path in pictures]

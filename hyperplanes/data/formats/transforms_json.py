@@ -110,8 +110,8 @@ def read_transforms_task(
     halves = [[at for at, index in enumerate(kept) if (index in query) == asked] for asked in (False, True)]
     if not all(halves):
         found = f"{len(halves[0])} to train and {len(halves[1])} to test on"
-        remedy = "copy the pictures to where the files name them, each in one split alone"
-        raise DataError(listing.source, "pictures of both splits", found, remedy)
+        remedy = "copy the images to the paths that the files state, each in only one split"
+        raise DataError(listing.source, "images of both splits", found, remedy)
     return PosedTask.split(scene, halves[0], halves[1], name)
 
 

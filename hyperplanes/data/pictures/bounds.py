@@ -75,16 +75,16 @@ def estimate_bounds(
     masks, small = _reduced(alpha[chosen], camera.select(cameras, chosen))
     ends = cut_off(masks)
     cut = float(ends.float().mean()) > OFTEN_CUT
-    sphere = room = Sphere(outer.centre, ROOM * outer.radius) if cut else outer
+    sphere = largest = Sphere(outer.centre, ROOM * outer.radius) if cut else outer
     for _ in range(3 if cut else 2):
         points = carve(masks, small, sphere, HULL_SIDE).centres()
         points = points[sphere.normalise(points).norm(dim=-1) <= 1]
         points = points[are_shown(points, small, ends)] if cut else points
         if not len(points):
-            return outer if sphere is room else sphere
+            return outer if sphere is largest else sphere
         ball = smallest_ball(points)
         radius = HULL_MARGIN * (ball.radius + sphere.radius / HULL_SIDE * 3**0.5)
-        sphere = Sphere(ball.centre, min(radius, room.radius))
+        sphere = Sphere(ball.centre, min(radius, largest.radius))
     return sphere
 
 

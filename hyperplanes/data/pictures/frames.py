@@ -128,9 +128,9 @@ def assemble(listing: Listing, downscale: int | None = None, *, complete: bool =
     found = [_examine(frames[index], source) for index in kept]
     size = _common_size([one.size for one in found])
     if scaled := [one.frame.name for one in found if one.size != size]:
-        notes.append(f"{len(scaled)} pictures of other sizes scaled to {size[1]} x {size[0]} pixels: {listed(scaled)}")
+        notes.append(f"{len(scaled)} images of other sizes scaled to {size[1]} x {size[0]} pixels: {listed(scaled)}")
     if turns := [one.frame.name for one in found if one.turn != 1]:
-        notes.append(f"{len(turns)} pictures turned as their EXIF orientation says: {listed(turns)}")
+        notes.append(f"{len(turns)} images rotated by their EXIF orientation: {listed(turns)}")
     factor = _factor(size, downscale, complete, source)
     if factor > 1:
         why = "" if downscale else "; --downscale 1 keeps every pixel"
@@ -148,7 +148,7 @@ def assemble(listing: Listing, downscale: int | None = None, *, complete: bool =
         matrices.append(matrix)
     if any(alphas) and not all(alphas):
         bare = [one.frame.name for one, alpha in zip(found, alphas, strict=True) if not alpha]
-        notes.append(f"{len(bare)} of {len(found)} pictures have no mask and count as covered: {listed(bare)}")
+        notes.append(f"{len(bare)} of {len(found)} images have no mask and are taken as opaque: {listed(bare)}")
     depths = [one.frame.depths for one in found]
     scene = posed(
         pictures,
@@ -184,19 +184,19 @@ def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tup
     if missing and len(there) < ENOUGH * len(frames):
         raise DataError(
             source,
-            f"the pictures of its {len(frames)} frames, or of two thirds of them",
+            f"images for at least two thirds of its {len(frames)} frames",
             f"{len(there)} ({missing[0].path} and {len(missing) - 1} others are missing)",
-            "copy the pictures to where the file names them",
+            "copy the images to the paths that the file states",
         )
     if missing:
         names = listed([frame.name for frame in missing])
-        notes.append(f"{len(there)} of {len(frames)} frames have a picture, {len(missing)} are missing: {names}")
+        notes.append(f"{len(there)} of {len(frames)} frames have an image, {len(missing)} are missing: {names}")
     first: dict[Path, int] = {}
     for index in there:
         first.setdefault(frames[index].path.resolve(), index)
     kept = list(first.values())
     if again := [frames[index].name for index in sorted({*there} - {*kept})]:
-        notes.append(f"{len(again)} frames left out, whose pictures are listed before: {listed(again)}")
+        notes.append(f"{len(again)} frames left out, whose images earlier frames list: {listed(again)}")
     return kept, notes
 
 
@@ -207,9 +207,9 @@ def _examine(frame: Frame, source: str | Path) -> _Found:
         if header.orientation != 1:
             raise DataError(
                 frame.path,
-                "pixels stored upright, as the cameras' file does not say for which size it was made",
+                "pixels stored upright, as the file of cameras states no image size",
                 f"EXIF orientation {header.orientation}",
-                "turn the pixels (mogrify -auto-orient), or drop the tag where the poses are of the stored pixels",
+                "rotate the pixels (mogrify -auto-orient), or remove the tag if the poses are of the stored pixels",
             )
         return _Found(frame, header.size, 1)
     if _same_shape(header.size, frame.size):
@@ -218,9 +218,9 @@ def _examine(frame: Frame, source: str | Path) -> _Found:
         return _Found(frame, header.size, header.orientation)
     raise DataError(
         frame.path,
-        f"the shape of the {frame.size[1]} x {frame.size[0]} pixels that {Path(source).name} states",
+        f"the aspect ratio of the {frame.size[1]} x {frame.size[0]} pixels that {Path(source).name} states",
         f"{_text(header)}",
-        "give the pictures that the cameras were made for, or correct w and h",
+        "give the images that the cameras were calibrated for, or correct w and h",
     )
 
 
@@ -291,7 +291,7 @@ def _pixels(one: _Found, size: tuple[int, int], factor: int) -> tuple[Pixels, bo
                 one.frame.mask,
                 f"{one.size[1]} x {one.size[0]} pixels, as {one.frame.path.name}",
                 f"{stored[1]} x {stored[0]}",
-                "scale the mask to the size of its picture",
+                "scale the mask to the size of its image",
             )
         values, has_alpha = read_image(one.frame.mask, stored)
         picture[..., 3] = opacity_of(values if stored == one.size else turned(values, one.turn), has_alpha)

@@ -118,7 +118,7 @@ def resized(picture: Pixels, size: tuple[int, int]) -> Pixels:
 def check_downscale(factor: int, size: tuple[int, int], source: str | Path) -> None:
     """Raise DataError if images of this (height, width) cannot be scaled down by this factor."""
     if not 1 <= factor <= min(size):
-        found = f"{factor} for pictures of {size[1]} x {size[0]} pixels"
+        found = f"{factor} for images of {size[1]} x {size[0]} pixels"
         raise DataError(source, f"a downscale from 1 to {min(size)}", found, "give another --downscale")
 
 
@@ -218,7 +218,7 @@ def _open(path: Path) -> Image.Image:
     except FileNotFoundError as error:
         raise DataError(path, "an image", "nothing", "check the name, or take the frame out") from error
     except Image.DecompressionBombError as error:
-        raise DataError(path, f"at most {LARGEST_IMAGE} pixels", "far more", "scale it down") from error
+        raise DataError(path, f"at most {LARGEST_IMAGE} pixels", "more", "scale it down") from error
     except DataError:
         raise
     except PermissionError as error:

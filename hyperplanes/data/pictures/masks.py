@@ -36,7 +36,7 @@ def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path) ->
         bare = [p.name for m, p in zip(masks, pictures, strict=True) if m is None and p.exists()]
         found = f"{len(present) - len(bare)}, none for {bare[0]}"
         raise DataError(
-            folder, f"a mask for each of the {len(present)} pictures", found, "add them, or rename the folder"
+            folder, f"a mask for each of the {len(present)} images", found, "add the others, or rename the folder"
         )
     return [mask if picture.exists() else None for mask, picture in zip(masks, pictures, strict=True)]
 
@@ -46,8 +46,8 @@ def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None
 
     The mask of NAME.jpg may be called NAME or NAME_mask with any suffix or, as in COLMAP, NAME.jpg.png. If several
     folders hold masks of that name, the one whose parent folders match those of the image best is taken. If no name
-    matches any image, there are as many masks as images and all names are numbers, the two are paired in numerical
-    order: NeuS publishes image/000000.png with mask/000.png.
+    matches any image, but there are as many masks as images and all names are numbers, they are paired in numerical
+    order; NeuS, for example, publishes image/000000.png with mask/000.png.
 
     Args:
         folder: the folder with the masks, which are searched in its subfolders too.
@@ -79,8 +79,8 @@ def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None
     if any(masks):
         return masks
     if (by_number := _by_number(files, pictures)) is None:
-        remedy = "rename them as the pictures, or number as many as there are pictures"
-        raise DataError(folder, "masks named as the pictures", f"none of them for {pictures[0].name}", remedy)
+        remedy = "name the masks as the images, or number as many masks as there are numbered images"
+        raise DataError(folder, "masks named as the images", f"none for {pictures[0].name}", remedy)
     return list(by_number)
 
 
@@ -98,7 +98,7 @@ def _of_the_same_folders(masks: Sequence[Path], picture: Path, folder: Path) -> 
             folder,
             f"one mask for {picture}",
             f"{len(best)}: {', '.join(mask.relative_to(folder).as_posix() for mask in best[:3])}",
-            "put the masks into folders with the same names as those of the pictures",
+            "put the masks into folders with the same names as those of the images",
         )
     return best[-1]
 

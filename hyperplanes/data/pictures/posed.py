@@ -144,7 +144,7 @@ class PosedTask:
     def alternating(cls, scene: Posed, name: str) -> PosedTask:
         """Every other view, beginning with the first, as support, the rest as query; DataError for a single view."""
         if len(scene) < 2:
-            remedy = "add views; `render --all-views` shows a model what there is"
+            remedy = "add views, or use `render --all-views`, which needs no query views"
             raise DataError(name, "two views or more", f"{len(scene)}", remedy)
         index = list(range(len(scene)))
         return cls.split(scene, index[::2], index[1::2], name)
@@ -199,9 +199,9 @@ def posed(
         if bounds is not None:
             centre = bounds.centre
             bounds = Sphere((centre[0] - x, centre[1] - y, centre[2] - z), bounds.radius)
-        notes = (*notes, f"the world is shifted: ({x:.10g}, {y:.10g}, {z:.10g}) is its new origin, for float32's sake")
+        notes = (*notes, f"the world is shifted for float32 precision: new origin ({x:.10g}, {y:.10g}, {z:.10g})")
     if has_alpha and are_inverted(rgba[:, 3:]):
-        notes = (*notes, "masks cover the pictures' borders and not their middle: invert them, white is the object")
+        notes = (*notes, "masks seem to show the background; invert them, white is the object")
     try:
         cameras = camera.pinhole(
             torch.from_numpy(intrinsics).float(), torch.from_numpy(camera_from_world).float(), height, width

@@ -59,8 +59,8 @@ def check_lens(matrix: Array, coefficients: tuple[float, ...], size: tuple[int, 
         stated = ", ".join(f"{n} = {v:g}" for n, v in zip(COEFFICIENTS, coefficients, strict=True) if v)
         raise DataError(
             str(source),
-            "a lens that shows every pixel once",
-            f"{stated}, which folds {folded:.0%} of the picture",
+            "a lens that maps one direction to each pixel",
+            f"{stated}, which folds {folded:.0%} of the image",
             "calibrate again, or undistort the images first",
         )
 

@@ -87,7 +87,7 @@ def brown_lens(
         quotient = (1 + share[:, :3] @ fitted[:3]) / (1 + share[:, :3] @ fitted[3:])
         error = np.abs(quotient - 1 - wanted) * share[:, 0] ** 0.5 * reach
         if not error.max() < _LARGEST_ERROR:
-            found = f"k4 = {numbers[3]:g}, met to {error.max():.1g} focal lengths"
-            raise DataError(source, "a lens that OpenCV's model can show", found, "calibrate with k1, k2, k3 only")
+            found = f"k4 = {numbers[3]:g}, fitted to within {error.max():.1g} focal lengths"
+            raise DataError(source, "distortion that OpenCV's model can fit", found, "calibrate with k1, k2, k3 only")
         above, below = fitted[:3] / scale[:3], fitted[3:] / scale[:3]
     return (*above[:2].tolist(), *numbers[4:6], above[2].item(), *below.tolist())

@@ -45,7 +45,7 @@ def find_photographs(
     home = max(known, key=lambda each: sum(name.lower() in known[each] for name in plain))
     stems = Counter(path.stem.lower() for path in listed[home])
     if several := [name for name in plain if stems[name.lower()] > 1]:
-        remedy = "move those away that the cameras are not of"
+        remedy = "remove those that the cameras do not belong to"
         raise DataError(source, f"one photograph {several[0]}", "several, with different endings", remedy)
     paths = [known[home].get(name.lower()) or inside(folder / home, name, source) for name in plain]
     if not any(path.is_file() for path in paths):
