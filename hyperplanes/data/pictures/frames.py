@@ -115,8 +115,8 @@ def assemble(listing: Listing, downscale: int | None = None, *, complete: bool =
     Args:
         listing: what the files state.
         downscale: reduce the images by this factor, averaging pixels. None reduces them to at most MEGAPIXEL pixels.
-        complete: treat a missing image as an error, and do not reduce images if `downscale` is None. Readers of data
-            sets use it, since these were made as a whole and in the size that is wanted.
+        complete: treat a missing image as an error, and do not reduce images if `downscale` is None. Readers of native
+            data sets and of learnit's layout use it.
 
     Returns:
         The images, and the indices of the frames that they belong to. Raises DataError if an image is missing or does

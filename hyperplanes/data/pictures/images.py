@@ -52,7 +52,7 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 
 Pixels = npt.NDArray[np.uint8]
 
-_OVERSHOOT = 1.5  # largest value of a floating-point image over white; masks resampled by Lanczos reach 1.49
+_OVERSHOOT = 1.5  # largest ratio of a floating-point value to white; masks resampled by Lanczos reach 1.49
 _REMEDY = "render, export or download it again"
 _ORIENTATION = 0x0112  # tag of EXIF: 1 is upright, 2 to 8 are the other rotations and reflections
 _TURNS = {
