@@ -1,4 +1,4 @@
-"""Photographs or a video of an object to a scene: camera poses, masks, and where the object is."""
+"""Make a scene from photographs or a video of an object: find camera poses, masks and the position of the object."""
 
 from hyperplanes.capture.pipeline import Captured, Settings, capture
 

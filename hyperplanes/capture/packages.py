@@ -1,4 +1,4 @@
-"""Packages of the extra `photos`, imported when they are needed."""
+"""Import the packages of the extra `photos` when they are needed."""
 
 from __future__ import annotations
 
@@ -13,30 +13,33 @@ __all__ = ["is_installed", "require", "stated_threads"]
 
 
 def is_installed(name: str) -> bool:
-    """Whether a package can be imported; it is not imported."""
+    """Whether a package is installed, without importing it."""
     return find_spec(name) is not None
 
 
 def stated_threads() -> int:
-    """How many threads OMP_NUM_THREADS allows, the first of its numbers; 0 where it says nothing."""
+    """The number of threads that OMP_NUM_THREADS states, the first if it is a list; 0 if it states none."""
     stated = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
     return int(stated) if stated.isdigit() else 0
 
 
 def require(name: str, purpose: str) -> Any:
-    """A package of the extra `photos`; signals are handled as before, which pycolmap's import would change.
+    """A module of a package of the extra `photos`. Signal handlers, which pycolmap's import changes, are restored.
 
     Args:
-        name: of its module.
-        purpose: what it does here, for the message.
+        name: of the module.
+        purpose: what the package does here, for the message.
+
+    Returns:
+        The module.
 
     Raises:
-        ValueError: it is not installed, or cannot be imported.
+        ValueError: the package is not installed, or cannot be imported.
     """
     try:
         with keep_handlers():
             return import_module(name)
-    except Exception as error:  # pycolmap raises a RuntimeError in answer to an ImportError, or to an interrupt
+    except Exception as error:  # pycolmap raises RuntimeError after an ImportError or an interrupt
         if (interrupt := interrupt_behind(error)) is not None:
             raise interrupt from None
         found = " ".join(str(error.__cause__ or error).split())

@@ -1,4 +1,4 @@
-"""Photographs as people have them: found, upright, scaled, and grouped by the camera that took them."""
+"""Find photographs, read their headers, group them by camera, and read them upright and scaled."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from hyperplanes.utilities.files import DataError
 __all__ = ["FEWEST", "Photograph", "find_photographs", "list_photographs", "read_upright", "without_copies"]
 
 FEWEST = 3
-"""Photographs from which poses can be found at all."""
+"""Least number of photographs from which poses can be found."""
 
-_LOOKED_AT = 1000  # entries of a folder
+_LOOKED_AT = 1000  # most entries of a folder that are searched
 _MAKE, _MODEL, _EXIF = 0x010F, 0x0110, 0x8769
 _FOCAL, _FOCAL_35, _PIXELS_X = 0x920A, 0xA405, 0xA002
 _PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
 _UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # millimetres, by EXIF's number of the unit
 _FULL_FRAME = 36.0  # millimetres: the longer side of the film that 35 mm equivalents refer to
-_SCALED_MASK = 1.02  # by which the shape of a mask may differ from that of its photograph
+_SCALED_MASK = 1.02  # largest ratio of the aspect ratios of a mask and its photograph
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class Photograph:
 
     Attributes:
         path: the file.
-        name: a plain name without ending, its own in the capture.
-        size: (height, width) upright.
-        orientation: EXIF's number, 1 where the pixels are stored upright.
-        camera: what tells cameras apart: make, model, focal length and longer and shorter side.
-        focal: focal length in units of the longer side, None where EXIF does not say.
-        turned: whether it is stored lying on its side, turned by 90 degrees counterclockwise, to have the shape that
-            most photographs of the camera have.
-        mask: a picture of what belongs to the object, or None.
+        name: a plain name without suffix, unique in the capture.
+        size: (height, width) when upright.
+        orientation: EXIF's orientation, 1 if the pixels are stored upright.
+        camera: identifies the camera: make, model, focal length, longer and shorter side.
+        focal: focal length in units of the longer side, None if EXIF does not state it.
+        turned: whether the capture stores it rotated by 90 degrees counterclockwise, so that it has the same format,
+            landscape or portrait, as most photographs of its camera.
+        mask: the file of its mask, or None.
     """
 
     path: Path
@@ -71,17 +71,17 @@ class Photograph:
 
     @property
     def up_in_camera(self) -> tuple[float, float, float]:
-        """Which way is up in the stored picture: x right, y down, z forward."""
+        """The up direction in the camera of the image that the capture stores: x right, y down, z forward."""
         return (-1.0, 0.0, 0.0) if self.turned else (0.0, -1.0, 0.0)
 
 
 def find_photographs(folder: Path) -> list[Path]:
-    """The photographs of a folder, or of the one in it that holds them, such as images/, in the order of their names.
+    """The photographs of a folder, or of one such as images/ in it, sorted by name.
 
-    Numbers in names count as numbers, so that IMG_9 comes before IMG_10.
+    Numbers in names are sorted as numbers, so that IMG_9 comes before IMG_10.
 
     Raises:
-        DataError: fewer than three, or HEIC photographs where nothing can read them.
+        DataError: fewer than three photographs, or HEIC photographs if pillow-heif is not installed.
     """
     home = photographs_folder(folder)
     files = [] if home is None else [p for p in home.iterdir() if p.is_file() and not p.name.startswith(".")]
@@ -98,7 +98,7 @@ def find_photographs(folder: Path) -> list[Path]:
 
 
 def _elsewhere(folder: Path) -> str:
-    """What to do about a folder with too few photographs: a folder or a video in it may be what was meant."""
+    """What to do about too few photographs. The user may have meant a folder or a video inside the given folder."""
     children = sorted(child for _, child in zip(range(_LOOKED_AT), folder.iterdir(), strict=False))
     for child in children:
         if child.name != "masks" and child.is_dir() and (home := photographs_folder(child)):
@@ -109,14 +109,14 @@ def _elsewhere(folder: Path) -> str:
 
 
 def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[list[Photograph], list[str]]:
-    """What is known of photographs before they are decoded.
+    """Photographs from their headers, without decoding them.
 
     Args:
         paths: the files.
-        masks: a folder of masks named as the photographs (or NAME_mask), or None.
+        masks: a folder of masks that are matched as by `match_masks`, or None.
 
     Returns:
-        The photographs that can be read, and a sentence about each one that cannot.
+        The photographs whose headers can be read, and a note about each of the others.
     """
     found, notes = [], []
     names = set[str]()
@@ -143,7 +143,7 @@ def list_photographs(paths: Sequence[Path], masks: Path | None = None) -> tuple[
 
 
 def without_copies(photographs: Sequence[Photograph]) -> tuple[list[Photograph], list[str]]:
-    """The photographs without those whose file is byte for byte that of an earlier one, and a sentence about these."""
+    """The photographs without files that are byte-for-byte copies of earlier ones, and a note if there are any."""
     sizes = Counter(one.path.stat().st_size for one in photographs)
     seen: set[bytes] = set()
     kept, copies = [], []
@@ -162,16 +162,15 @@ def without_copies(photographs: Sequence[Photograph]) -> tuple[list[Photograph],
 def read_upright(
     photograph: Photograph, max_size: int
 ) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
-    """The pixels of a photograph as it is stored in a capture: upright or on its side; and its mask.
+    """The pixels of a photograph and its mask: upright, or rotated as `Photograph.turned` says.
 
-    It is scaled down to `max_size` pixels along the longer side where it has more.
+    Both are scaled down if the longer side has more than `max_size` pixels.
 
     Returns:
-        The picture, which a mask does not change, and the opacity that the mask or, without one, alpha states; None
-        where there is neither.
+        The image without its alpha, and the opacity: the mask, otherwise alpha, otherwise None.
 
     Raises:
-        DataError: a photograph that is broken, or a mask of another shape.
+        DataError: the photograph or its mask cannot be read, or the mask has another aspect ratio.
     """
     rgba, alpha = read_image(photograph.path)
     stored = rgba.shape[:2]
@@ -182,7 +181,7 @@ def read_upright(
         values, has_alpha = read_image(photograph.mask)
         opacity = opacity_of(values, has_alpha)
         if _same_shape(opacity.shape, stored) and not _same_shape(opacity.shape, upright):
-            opacity = turned(opacity, photograph.orientation)  # drawn on the pixels as they are stored
+            opacity = turned(opacity, photograph.orientation)  # the mask belongs to the pixels as they are stored
         elif stored == upright and photograph.orientation != 1:
             opacity = turned(opacity, photograph.orientation)
         if not _same_shape(opacity.shape, upright):
@@ -212,11 +211,15 @@ def scaled_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
 
 
 def _same_shape(size: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    """Whether two sizes have nearly the same aspect ratio."""
     return 1 / _SCALED_MASK < size[0] * other[1] / (size[1] * other[0]) < _SCALED_MASK
 
 
 def _with_one_shape(photographs: list[Photograph]) -> list[Photograph]:
-    """The same, of each camera those turned that have not the shape, upright or across, of most."""
+    """The photographs, with `turned` set for those that differ in format, landscape or portrait, from most of a camera.
+
+    A camera so has images of one size, which share a calibration.
+    """
     across: dict[str, Counter[bool]] = {}
     for one in photographs:
         across.setdefault(one.camera, Counter())[one.size[1] > one.size[0]] += 1
@@ -228,11 +231,12 @@ def _with_one_shape(photographs: list[Photograph]) -> list[Photograph]:
 
 
 def _natural(path: Path) -> list[Any]:
-    """A key by which numbers in names sort as numbers."""
+    """A key that sorts numbers in names as numbers."""
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", path.name.lower()) if part]
 
 
 def _reads_heif() -> bool:
+    """Whether HEIC can be read; registers the format with Pillow."""
     if find_spec("pillow_heif") is None:
         return False
     import pillow_heif
@@ -242,7 +246,7 @@ def _reads_heif() -> bool:
 
 
 def _exif(path: Path) -> dict[int, Any]:
-    """The tags of a photograph that matter here; a damaged block says nothing."""
+    """The EXIF tags of a photograph; none if they are damaged."""
     with Image.open(path) as image:
         if "exif" not in image.info:
             return {}

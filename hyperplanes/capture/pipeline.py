@@ -1,4 +1,4 @@
-"""From photographs to a scene that every other verb reads: pictures, poses, masks, in stages that can be continued."""
+"""Make a scene, which all other commands read, from photographs. An interrupted run can be continued."""
 
 from __future__ import annotations
 
@@ -38,12 +38,14 @@ from hyperplanes.utilities.writing import write_whole
 __all__ = ["Captured", "Progress", "Settings", "capture"]
 
 WORK = "capture"
-"""The folder within the scene that holds what the stages made."""
+"""The folder in the scene that holds the results of the stages."""
 
-ROOM = 1.5  # times the radius of the points of the object, within which its hull is carved: what is smooth has none
+ROOM = 1.5
+"""Radii of the sphere around the object's sparse points: the sphere in which its hull is carved. It is larger than the
+points' sphere because smooth parts of the object have no points."""
 
-ENOUGH = 0.8  # of the photographs: with fewer registered, there is advice
-QUALITY = 96  # of JPEG, without subsampled colours
+ENOUGH = 0.8  # of the photographs: if fewer get a pose, a note gives advice
+QUALITY = 96  # of JPEG, without chroma subsampling
 
 ADVICE = (
     "walk around the object in small steps, 20 degrees or less, so that neighbouring photographs show mostly the same, "
@@ -55,13 +57,14 @@ ADVICE = (
 @checked_fields
 @dataclass(frozen=True)
 class Settings:
-    """How a capture is made.
+    """Settings of a capture.
 
     Attributes:
-        max_size: pixels along the longer side, in which poses are found and pictures written; at least 64.
-        mask: auto, given, colour, network, grabcut, none, or a command with {image} and {mask} in it.
-        frames: taken out of a video; at least 3.
-        order: "auto", "sequence" (neighbours are matched) or "any" (all pairs are).
+        max_size: pixels along the longer side at which poses are found and images are written; at least 64.
+        mask: auto, given, colour, network, grabcut, none, or a command that contains {image} and {mask}.
+        frames: number of frames extracted from a video; at least 3.
+        order: "sequence" matches neighbouring photographs, "any" all pairs. "auto" is "sequence" for a video and for
+            more than 80 photographs.
     """
 
     max_size: Annotated[int, range(64, 1 << 16)] = 1000
@@ -72,7 +75,7 @@ class Settings:
 
 @dataclass
 class _Work:
-    """What the stages share."""
+    """The settings and results that all stages share."""
 
     stages: Stages
     settings: Settings
@@ -86,16 +89,16 @@ def capture(
     """Find poses and masks of photographs, and write them as a scene.
 
     Args:
-        source: a folder of photographs, in which masks/ may lie, or a video.
-        out: the folder of the scene. What the stages made lies in its folder capture/; the same call goes on there. No
-            photograph may lie in its folders images/, masks/ and capture/, in which files are replaced.
-        settings: how.
-        progress: called as it goes on.
+        source: a folder of photographs, which may contain masks/, or a video.
+        out: the folder of the scene. The results of stages are kept in its folder capture/, so that the same call
+            continues an interrupted one. No photograph may lie in its folders images/, masks/ and capture/, in which
+            files are replaced.
+        settings: of the capture.
+        progress: called during the work.
 
     Returns:
-        What was written and what there is to say of it.
-
-    Too few photographs, photographs without common features, and settings that cannot be are a ValueError.
+        A summary of the scene, with notes for the user. Raises ValueError for too few photographs, photographs without
+        common features, or a masking method that cannot work.
     """
     source, out, settings = Path(source), Path(out), settings or Settings()
     check_mask(settings.mask)
@@ -117,10 +120,10 @@ def capture(
 
 
 def _refuse_inside(out: Path, *sources: Path) -> None:
-    """Refuse to write where photographs lie: pictures of a scene take the place of what is there.
+    """Check that no source lies in the folders to write, since the files of the scene would replace it.
 
     Raises:
-        DataError: the scene's own folder, or something in one that is written to.
+        DataError: a source is the scene's own folder, or lies in a folder that is written.
     """
     home = out.resolve()
     written = [home / name for name in ("images", "masks", WORK)]
@@ -160,14 +163,21 @@ def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
 
 
 def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photograph], list[Picture], dict[int, Path]]:
-    """The photographs upright and scaled, as files, and the masks that came with them by their number."""
+    """Write the photographs upright and scaled.
+
+    Returns:
+        The photographs that can be read, their written images, and the files of given masks by the index of the image.
+
+    Raises:
+        DataError: a given mask that does not fit its photograph, or no mask at all with `--mask given`.
+    """
     max_size = work.settings.max_size
     masked = work.settings.mask in ("auto", "given")
     key = fingerprint([(_stamp(one.path), one.mask and _stamp(one.mask)) for one in photographs], max_size, masked)
     folder = work.stages.folder / "pictures"
     done = work.stages.begin("pictures", key)
     if done is None:
-        require("pycolmap", "finds camera poses")  # which `_poses` needs, before minutes of scaling
+        require("pycolmap", "finds camera poses")  # for `_poses`, but checked before minutes of scaling
         done = {"sizes": [], "masked": [], "broken": {}}
         with_alpha, transparent = list[int](), False
         for index, one in enumerate(photographs):
@@ -186,7 +196,7 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
                 write_whole(folder / f"{index:05d}.mask.png", encode_png(opacity), durable=False)
                 (with_alpha if one.mask is None else done["masked"]).append(index)
                 transparent |= one.mask is None and bool((opacity < 255).any())
-        done["masked"] += with_alpha if transparent else []  # alpha that is opaque in all of them says nothing
+        done["masked"] += with_alpha if transparent else []  # alpha that is opaque in all images is no mask
         work.stages.finish("pictures", key, done)
         work.progress("photographs", len(photographs), len(photographs), "upright and scaled")
     if work.settings.mask == "given" and not done["masked"]:
@@ -207,12 +217,12 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
 
 
 def _stamp(path: Path) -> tuple[str, float, int]:
-    """What tells a file from others."""
+    """Path, time of modification and size of a file, which change when the file does."""
     return str(path.resolve()), path.stat().st_mtime, path.stat().st_size
 
 
 def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
-    """The largest model; other features are tried while it holds few of the pictures. Masks have no part in it."""
+    """The largest model. While it has few of the images, other settings of features are tried. Masks are not used."""
     shown = work.stages.folder / "pictures"
     order = work.settings.order
     sequential = order == "sequence" or (order == "auto" and (is_video or len(pictures) > EXHAUSTIVE))
@@ -265,7 +275,7 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
 def _straight(
     model: SparseModel, pictures: Sequence[Picture], opacities: dict[int, Path], work: _Work
 ) -> tuple[list[Pixels], list[Pixels | None]]:
-    """The pictures (height, width, 3) that were posed, without their lens, and the masks that came with them."""
+    """The undistorted images (height, width, 3) that have a pose, and their given masks."""
     straight, given = list[Pixels](), list[Pixels | None]()
     for row, index in enumerate(model.pictures.tolist()):
         path = work.stages.folder / "pictures" / pictures[index].file
@@ -289,7 +299,7 @@ def _masks(
     names: Sequence[str],
     work: _Work,
 ) -> tuple[list[np.ndarray] | None, str]:
-    """A mask a camera, opacity in [0, 1], and how they were found."""
+    """One mask per camera, opacity in [0, 1], and the name of the method; None and "none" without masks."""
     if work.settings.mask == "none":
         return None, "none"
     bare = [name for name, opacity in zip(names, given, strict=True) if opacity is None]
@@ -328,7 +338,7 @@ def _placed(
     given: Sequence[Pixels | None],
     work: _Work,
 ) -> tuple[Placement, list[np.ndarray] | None]:
-    """Where the object is, and the masks after they were compared with each other; given ones stay as they are."""
+    """The position of the object, and the masks after they were compared with each other. Given masks do not change."""
     chosen = object_points(model, masks)
     sphere = object_sphere(model, chosen)
     if masks is not None:
@@ -336,7 +346,7 @@ def _placed(
         own = [opacity is not None for opacity in given]
         pictures = None if all(own) or not is_installed("cv2") else straight
         found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius), pictures)
-        for kept, done in ((True, "look at them"), (False, "they were mended by what these show together")):
+        for kept, done in ((True, "check them"), (False, "they were corrected by what the others show")):
             if names := [photographs[row].name for row in found.wrong if own[row] == kept]:
                 work.notes.append(f"{len(names)} masks contradict the others, {done}: {listed(names)}")
         work.progress("agreement", 1, 1, f"{1 - float(found.disagreement.mean()):.1%} of their area")
@@ -356,6 +366,7 @@ def _written(
     placement: Placement,
     work: _Work,
 ) -> Captured:
+    """Write the scene."""
     moved = model.moved(placement.z_up_from_world())
     files = {}
     for row, (one, picture) in enumerate(zip(photographs, straight, strict=True)):

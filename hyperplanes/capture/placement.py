@@ -1,4 +1,4 @@
-"""Where the object of a capture is, and which way is up."""
+"""Find the position of the object in a capture, and the up direction."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ __all__ = ["Placement", "find_up", "object_points", "object_sphere"]
 
 Mask = Float[np.ndarray, "height width"]
 
-INSIDE = 0.8  # of the cameras that observed a point must show it within their masks
-STRAY = 3.0  # times the median distance to its neighbours, from which on a point belongs to nothing
+INSIDE = 0.8  # of the cameras that observe a point must have it in their masks
+OUTLIER = 3.0  # median distances to the 8th neighbour: a point whose own is larger is an outlier
 NEIGHBOURS = 8
 FEWEST_POINTS = 30
-MARGIN = 1.1  # of the sphere around the points, for what has none
-LEVEL = np.deg2rad(20)  # within which the cameras' horizon must agree with how they were held
-SPREAD = 4.0  # how much better than in any other direction the horizon must fit
+MARGIN = 1.1  # radii of the sphere around the points: parts of the object without points may lie outside it
+LEVEL = np.deg2rad(20)  # largest angle between the normal of the cameras' x axes and the mean up direction
+SPREAD = 4.0  # least ratio of the two smallest eigenvalues of the x axes' scatter matrix for their normal to be used
+# of the ground plane: distance of its points in radii of the sphere, angle to the up direction, and share of the points
 PLANE_NEAR, PLANE_LEVEL, PLANE_SHARE = 0.01, np.deg2rad(12), 0.15
 
 
 @dataclass(frozen=True)
 class Placement:
-    """An object in the world of its capture.
+    """The position of the object and the up direction, in the world of structure from motion.
 
     Attributes:
-        sphere: around it.
+        sphere: around the object.
         up: unit vector.
-        up_from: what told which way is up, in words.
+        up_from: from what the up direction was determined, as a text for the user.
     """
 
     sphere: Sphere
@@ -43,7 +44,7 @@ class Placement:
     up_from: str
 
     def z_up_from_world(self) -> Float[np.ndarray, "4 4"]:
-        """The similarity after which the sphere is the unit sphere, and z is up as in nerfstudio's worlds."""
+        """The similarity that maps the sphere to the unit sphere and the up direction to z, as in nerfstudio."""
         z = self.up / np.linalg.norm(self.up)
         x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
         x /= np.linalg.norm(x)
@@ -55,19 +56,20 @@ class Placement:
 
 
 def object_points(model: SparseModel, masks: Sequence[Mask] | None) -> Bool[np.ndarray, " point"]:
-    """Which points belong to the object: those that nearly all of their cameras show within their masks.
+    """Which points belong to the object: those inside the masks of at least 80 % of the cameras that observe them.
 
-    Without masks, those within half the distance between the cameras and the place that they look at.
+    Without masks, they are the points around the point nearest to all optical axes, within half the median distance of
+    the cameras from it. Outliers are left out in both cases.
 
     Args:
         model: of structure from motion.
-        masks: of each camera's picture without its lens, or None.
+        masks: of the undistorted image of each camera, or None.
     """
     if masks is None:
         eyes, axes = _eyes_and_axes(model)
         centre = nearest_point(eyes, axes).numpy()
         reach = 0.5 * float(np.median(np.linalg.norm(model.centres - centre, axis=-1)))
-        return _without_strays(model.points, np.linalg.norm(model.points - centre, axis=-1) < reach)
+        return _without_outliers(model.points, np.linalg.norm(model.points - centre, axis=-1) < reach)
     inside = np.zeros(len(model.observed))
     for camera, mask in enumerate(masks):
         mine = model.observed[:, 0] == camera
@@ -77,15 +79,15 @@ def object_points(model: SparseModel, masks: Sequence[Mask] | None) -> Bool[np.n
         inside[mine] = mask[row.clip(0, height - 1), column.clip(0, width - 1)] > 0.5
     count = np.bincount(model.observed[:, 1], minlength=len(model.points))
     within = np.bincount(model.observed[:, 1], inside, minlength=len(model.points))
-    return _without_strays(model.points, within >= INSIDE * np.maximum(count, 1))
+    return _without_outliers(model.points, within >= INSIDE * np.maximum(count, 1))
 
 
 def object_sphere(model: SparseModel, chosen: Bool[np.ndarray, " point"]) -> Sphere:
-    """A sphere around points, a tenth larger; from the cameras alone where there are too few of them.
+    """A sphere around the points of the object, a tenth larger; from the cameras alone if there are fewer than 30.
 
     Args:
         model: of structure from motion.
-        chosen: its points that belong to the object.
+        chosen: which of its points belong to the object.
     """
     points = model.points[chosen]
     eyes, axes = _eyes_and_axes(model)
@@ -102,17 +104,22 @@ def find_up(
     sphere: Sphere,
     chosen: Bool[np.ndarray, " point"],
 ) -> tuple[Float[np.ndarray, " 3"], str]:
-    """Which way is up, and what told it.
+    """The up direction in the world, and a text for the user on what determined it.
 
-    The mean of what the cameras call up leans towards where they look down from. People hold cameras level: the
-    horizontal axes of their pictures are perpendicular to up, which is exact where the cameras stand around the
-    object. Where the object stands on a plane that is seen, as a table or a floor, its normal is better still.
+    There are three estimates, each better than the one before. The first is the mean of the cameras' own up directions,
+    which is tilted if the cameras look down from one side. The second assumes that cameras are held level, so that the
+    horizontal axes of upright images are perpendicular to the up direction; it is exact if the cameras are all around
+    the object. The third is the normal of the plane that the object stands on, such as a table or a floor, if enough
+    points of it were found.
 
     Args:
         model: of structure from motion.
-        up_in_camera: which way is up in each picture.
+        up_in_camera: the up direction of each image, in its camera.
         sphere: around the object.
-        chosen: the points of the object.
+        chosen: which points belong to the object.
+
+    Returns:
+        The unit vector, and the text.
     """
     rotations = model.camera_from_world[:, :3, :3]
     ups = np.einsum("cij,ci->cj", rotations, up_in_camera)
@@ -120,7 +127,7 @@ def find_up(
     if np.linalg.norm(up) < 1e-3:
         return np.array([0.0, 0.0, 1.0]), "nothing: the cameras do not agree"
     up /= np.linalg.norm(up)
-    across = np.stack([-up_in_camera[:, 1], up_in_camera[:, 0], np.zeros(len(ups))], -1)  # perpendicular in the picture
+    across = np.stack([-up_in_camera[:, 1], up_in_camera[:, 0], np.zeros(len(ups))], -1)  # perpendicular in the image
     right = np.einsum("cij,ci->cj", rotations, across)
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     level = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
@@ -131,22 +138,23 @@ def find_up(
 
 
 def _eyes_and_axes(model: SparseModel) -> tuple[torch.Tensor, torch.Tensor]:
+    """The centres and the optical axes of the cameras."""
     return torch.from_numpy(model.centres), torch.from_numpy(model.camera_from_world[:, 2, :3].copy())
 
 
-def _without_strays(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """The same without points far from all others of them."""
+def _without_outliers(points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """The chosen points without outliers, whose 8th neighbour is far away."""
     index = np.flatnonzero(chosen)
     if len(index) <= NEIGHBOURS:
         return chosen
     distance = KDTree(points[index]).query(points[index], NEIGHBOURS + 1)[0][:, -1]
     result = np.zeros_like(chosen)
-    result[index[distance <= STRAY * np.median(distance) + 1e-12]] = True
+    result[index[distance <= OUTLIER * np.median(distance) + 1e-12]] = True
     return result
 
 
 def _ground(points: np.ndarray, up: np.ndarray, sphere: Sphere) -> np.ndarray | None:
-    """The normal of the level plane under the object that enough of the points around it lie on, or None."""
+    """The normal of a level plane under the object by RANSAC, or None if too few of the points around it lie on one."""
     offset = points - np.array(sphere.centre)
     height = offset @ up
     near = (np.linalg.norm(offset, axis=-1) < 3 * sphere.radius) & (height < 0.2 * sphere.radius)
@@ -169,7 +177,7 @@ def _ground(points: np.ndarray, up: np.ndarray, sphere: Sphere) -> np.ndarray | 
         return None
     flat = offset[best] - offset[best].mean(0)
     values, vectors = np.linalg.eigh(flat.T @ flat)
-    if values[1] < 0.02 * values[2]:  # a line is no plane
+    if values[1] < 0.02 * values[2]:  # the points lie on a line, which determines no plane
         return None
     normal = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
     return normal if normal @ up > np.cos(PLANE_LEVEL) else None

@@ -1,4 +1,4 @@
-"""A capture on disk, as nerfstudio has it: transforms.json, images/, masks/ and the sparse points."""
+"""Write a scene as nerfstudio does: transforms.json, images/, masks/ and the sparse points."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hyperplanes.utilities.writing import write_json, write_whole
 __all__ = ["Captured", "straightened", "write_scene"]
 
 POINTS = "sparse_pc.ply"
-STRAIGHT = 0.25  # pixels that a lens may move a corner by without being taken out
+STRAIGHT = 0.25  # pixels: images whose corners the distortion moves less than this are not undistorted
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class Captured:
     """A scene that was written.
 
     Attributes:
-        folder: what holds it.
-        count: of its pictures.
-        points: how many points structure from motion found.
+        folder: of the scene.
+        count: number of images.
+        points: number of points that structure from motion found.
         error: mean reprojection error in pixels.
-        mask: how masks were found.
-        up_from: what told which way is up.
-        notes: what was left out, and what else there is to say, a sentence each.
+        mask: name of the method that found the masks.
+        up_from: from what the up direction was determined.
+        notes: messages for the user, one sentence each, such as what was left out.
     """
 
     folder: Path
@@ -52,16 +52,17 @@ def straightened(
     calibration: Float[np.ndarray, "3 3"],
     lens: Float[np.ndarray, " 2"],
 ) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
-    """A picture and its mask as a pinhole with the same calibration would have taken them, each by itself.
+    """An undistorted image and its mask, as a pinhole camera with the same calibration would have taken them.
 
     Args:
-        picture: with all that it shows.
-        opacity: of the object, None where nothing is known of it.
-        calibration: of its camera.
-        lens: k1 and k2.
+        picture: the image.
+        opacity: its mask, or None.
+        calibration: of its camera, integer pixel centres.
+        lens: the radial coefficients k1 and k2.
 
     Returns:
-        Where the lens did not see, the picture goes on as it ends, and the mask is 0.
+        The image and its mask. Where the lens did not see, the border of the image is repeated, and the mask is 0.
+        Distortion of less than a quarter of a pixel in the corners is ignored.
     """
     height, width = picture.shape[:2]
     corner = np.array([width, height]) / 2 / calibration[[0, 1], [0, 1]]
@@ -82,14 +83,14 @@ def write_scene(
     """Write the files of a scene, transforms.json last.
 
     Args:
-        folder: of the scene; the pictures and masks that an earlier transforms.json in it lists are deleted.
-        model: in a world with z up, in which the unit sphere holds the object.
-        names: of the pictures, one a camera.
-        sizes: (height, width) of each.
-        files: the pictures, and their masks where there are some, by their names within the folder.
+        folder: of the scene. Images and masks that an earlier transforms.json in it lists are deleted.
+        model: in a world with z up, in which the unit sphere contains the object.
+        names: of the images without suffix, one per camera.
+        sizes: (height, width) of each image.
+        files: the encoded images, and masks if there are any, by their paths in the folder.
 
     Returns:
-        What was written.
+        A summary of the scene.
     """
     former = _listed(folder / "transforms.json") - set(files)
     (folder / "transforms.json").unlink(missing_ok=True)
@@ -114,7 +115,7 @@ def write_scene(
 
 
 def _listed(document: Path) -> set[str]:
-    """The pictures and masks of a scene that was written before: images/NAME and masks/NAME."""
+    """The images and masks that an earlier transforms.json lists: images/NAME and masks/NAME."""
     try:
         frames = read_json(document).get("frames")
     except DataError:

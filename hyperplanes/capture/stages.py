@@ -1,4 +1,4 @@
-"""Stages of a long task whose results lie in files: what was done with the same inputs is not done again."""
+"""Stages of a long task, with results in files: a stage that is done is not repeated while its inputs stay the same."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["Stages", "fingerprint"]
 
 
 def fingerprint(*inputs: object) -> str:
-    """A short text that changes when one of the inputs does.
+    """A short hash of the inputs.
 
     Args:
-        inputs: what JSON can hold; other values count by their text.
+        inputs: values that JSON can hold; others are replaced by their `str`.
     """
     return sha256(json.dumps(inputs, sort_keys=True, default=str).encode())[:16]
 
@@ -29,22 +29,22 @@ class Stages:
     """The working folder of a task.
 
     Attributes:
-        folder: what holds the results.
+        folder: that holds the results.
     """
 
     folder: Path
 
     def begin(self, name: str, key: str) -> dict[str, Any] | None:
-        """What a stage left behind when it was last done with the same inputs.
+        """The result of a stage, if it is done with the same inputs; otherwise its folder is prepared.
 
-        Files of the stage that were made from other inputs are deleted, those of an interrupted one with these stay.
+        Files that were made from other inputs are deleted. Those of an interrupted stage with the same inputs are kept.
 
         Args:
             name: of the stage; its files lie in a folder of that name.
             key: fingerprint of its inputs.
 
         Returns:
-            What `finish` was given; None where the stage has to be done, or done to its end.
+            The result that `finish` was given; None if the stage has to be done or completed.
         """
         record = self._read(name)
         if record.get("key") == key and record.get("done") and isinstance(record.get("result"), dict):
@@ -56,18 +56,21 @@ class Stages:
         return None
 
     def finish(self, name: str, key: str, result: dict[str, Any]) -> dict[str, Any]:
-        """Note that a stage is done.
+        """Record that a stage is done.
 
         Args:
             name: of the stage.
-            key: as `begin` was given it.
-            result: what `begin` will return.
+            key: as given to `begin`.
+            result: that `begin` will return.
+
+        Returns:
+            The result.
         """
         write_json(self._path(name), {"key": key, "done": True, "result": result})
         return result
 
     def key(self, name: str) -> str:
-        """The fingerprint of the inputs that a stage was last begun with; empty where it never was."""
+        """The fingerprint of the inputs with which a stage was last begun; empty if it never was."""
         return self._read(name).get("key", "")
 
     def _path(self, name: str) -> Path:

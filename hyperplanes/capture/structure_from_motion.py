@@ -1,7 +1,7 @@
-"""Camera poses from pictures, by pycolmap: features, matches, incremental mapping.
+"""Camera poses from images, by pycolmap: features, matches, incremental mapping.
 
-Features and matches are kept in COLMAP's database as they are computed, so that an interrupted run goes on with those
-that are missing.
+Features and matches are written to COLMAP's database as they are computed, so that an interrupted run continues with
+those that are missing.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from hyperplanes.utilities.writing import write_whole
 __all__ = ["ATTEMPTS", "Features", "Picture", "find_poses", "pairs_to_match"]
 
 Progress = Callable[[str, int, int, str], None]
-"""Called with what is done, how far, of how much, and a few words."""
+"""Called with the name of the stage, the number of steps done, their total, and a short text."""
 
 EXHAUSTIVE = 80
-"""Pictures up to which all pairs are matched."""
+"""Largest number of images of which all pairs are matched by default."""
 
-OVERLAP = 10  # neighbours of a picture in a sequence that it is matched with
-CLOSING = 40  # pictures, evenly spread, that are matched with each other to close loops
-SMALLEST_MODEL = 3  # pictures
-SEED = 0  # of the random choices
+OVERLAP = 10  # images that follow an image in a sequence and are matched with it
+CLOSING = 40  # evenly spaced images that are matched with each other to close loops
+SMALLEST_MODEL = 3  # images
+SEED = 0  # of the random numbers
 FEATURES_AT_ONCE, PAIRS_AT_ONCE = 8, 150
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture that poses are searched for.
+    """An image whose pose is wanted.
 
     Attributes:
-        file: its name in the folder of pictures, without blanks.
-        camera: which pictures share a camera.
+        file: its name in the folder of images, without spaces.
+        camera: number of its camera; images of one number share a calibration.
         size: (height, width).
-        focal: focal length in pixels, or None where nothing is known.
+        focal: focal length in pixels, or None if it is unknown.
     """
 
     file: str
@@ -53,20 +53,20 @@ class Picture:
 
 @dataclass(frozen=True)
 class Features:
-    """How features are extracted.
+    """Settings of feature extraction.
 
-    Each is adapted to the slant of the surface that it lies on (affine shapes). Without that, a table seen at 12
-    degrees has next to no features in common with the same table at 35 degrees, where it is 2.8 times as high in the
-    picture: of 36 photographs in rounds at 12, 35 and 58 degrees 24 are posed without, even with three times the
-    features, and all with affine shapes. Photographs of a bust have a quarter more matches by them, and take half as
-    long again.
+    All features have affine shapes, which adapt to the slant of the surface. A table that is seen at an elevation of 35
+    degrees is 2.8 times as high in the image as at 12 degrees, so that without affine shapes the two images have almost
+    no features in common. Of 36 photographs on circles at 12, 35 and 58 degrees, 24 get a pose without affine shapes,
+    even with three times the features, and all 36 with them. For photographs of a bust, affine shapes give a quarter
+    more matches and take half as long again.
 
     Attributes:
-        name: of the attempt, for messages.
-        count: in a picture, at most.
-        peak: contrast that a feature must have, relative to COLMAP's default.
-        pooled: whether descriptors are pooled over several sizes of a feature.
-        below: share of the pictures that are registered, below which it is tried.
+        name: of the settings, for messages.
+        count: largest number of features in an image.
+        peak: least contrast of a feature, relative to COLMAP's default.
+        pooled: whether to use domain-size pooling, which averages descriptors over several scales of a feature.
+        below: these settings are tried if a smaller share of the images is registered.
     """
 
     name: str
@@ -81,10 +81,10 @@ ATTEMPTS = (
     Features("more and weaker features", 12288, 0.4, below=0.95),
     Features("more and weaker features, and domain-size pooling", 12288, 0.4, True, below=0.8),
 )
-"""What is tried in turn while too few pictures are registered.
+"""Settings that are tried in turn while too few images are registered.
 
-Of 36 photographs of 480 x 360 pixels of a plain spacecraft the first registers 31; with 8,192 features of half the
-contrast all are, each within 0.5 degrees and 1 % of the distance, in twice the time.
+Of 36 photographs of 480 x 360 pixels of a spacecraft with little texture, the first settings register 31. With 8,192
+features of half the contrast, all are registered, each within 0.5 degrees and 1 % of the distance, in twice the time.
 """
 
 
@@ -97,18 +97,18 @@ def find_poses(
     sequential: bool,
     progress: Progress,
 ) -> SparseModel | None:
-    """The poses of pictures: the largest of the models that structure from motion arrives at.
+    """The largest model that structure from motion finds.
 
     Args:
-        pictures: the order is that of a sequence, where they are one.
-        folder: what holds them.
-        database: COLMAP's, continued where it is there; the pictures are those it was made for.
-        features: how features are extracted.
-        sequential: match neighbours in the sequence, and some pictures from all of it, rather than all pairs.
-        progress: called as it goes on.
+        pictures: the images, in the order of the sequence if `sequential`.
+        folder: that holds them.
+        database: path of COLMAP's database. If it exists, it must be of the same images, and is continued.
+        features: settings of feature extraction.
+        sequential: match only the pairs of images that are described in `pairs_to_match`, instead of all.
+        progress: called during the work.
 
     Returns:
-        The model in COLMAP's world, or None where no two pictures could be registered.
+        The model in COLMAP's world, or None if no model was found.
     """
     pycolmap = require("pycolmap", "finds camera poses")
     with _quiet(pycolmap):
@@ -123,10 +123,10 @@ def find_poses(
 
 
 def pairs_to_match(count: int, sequential: bool) -> list[tuple[int, int]]:
-    """Which pictures are matched: all pairs, or neighbours in a sequence and what closes its loops.
+    """The pairs of images to match: all, or for a sequence those of neighbours and some that close loops.
 
-    In a sequence each picture is matched with the next OVERLAP, with those 16, 32, 64, ... after it, and CLOSING
-    pictures, evenly spread, with each other.
+    In a sequence, each image is matched with the next OVERLAP images and with those 16, 32, 64, ... after it. In
+    addition, CLOSING evenly spaced images are matched with each other.
 
     >>> pairs_to_match(3, sequential=False)
     [(0, 1), (0, 2), (1, 2)]
@@ -142,6 +142,7 @@ def pairs_to_match(count: int, sequential: bool) -> list[tuple[int, int]]:
 def _extract(
     pycolmap: Any, pictures: Sequence[Picture], folder: Path, database: Path, features: Features, progress: Progress
 ) -> None:
+    """Write the cameras, and the features of images that the database lacks."""
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = _threads()
     options.sift.max_num_features = features.count
@@ -169,7 +170,10 @@ def _extract(
 
 
 def _camera(pycolmap: Any, picture: Picture) -> Any:
-    """COLMAP's camera of one focal length and two radial coefficients."""
+    """COLMAP's camera with one focal length and two radial coefficients.
+
+    Without a known focal length, the initial value is 1.2 times the longer side of the image.
+    """
     height, width = picture.size
     focal = picture.focal or 1.2 * max(picture.size)
     camera = pycolmap.Camera.create_from_model_name(0, "RADIAL", focal, width, height)
@@ -178,6 +182,7 @@ def _camera(pycolmap: Any, picture: Picture) -> Any:
 
 
 def _match(pycolmap: Any, pictures: Sequence[Picture], database: Path, sequential: bool, progress: Progress) -> None:
+    """Match the pairs of images that the database lacks."""
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = _threads()
     with _opened(pycolmap, database) as opened:
@@ -187,17 +192,18 @@ def _match(pycolmap: Any, pictures: Sequence[Picture], database: Path, sequentia
     left = [pair for pair in pairs if pycolmap.image_pair_to_pair_id(*(number[name] for name in pair)) not in done]
     listed = database.with_suffix(".pairs.txt")
     for start in range(0, len(left), PAIRS_AT_ONCE):
-        progress("matches", len(pairs) - len(left) + start, len(pairs), "pairs of pictures")
+        progress("matches", len(pairs) - len(left) + start, len(pairs), "pairs of images")
         chunk = left[start : start + PAIRS_AT_ONCE]
         write_whole(listed, "\n".join(f"{first} {second}" for first, second in chunk).encode(), durable=False)
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = listed
         pycolmap.match_image_pairs(database, options, pairing, device=pycolmap.Device.cpu)
     listed.unlink(missing_ok=True)
-    progress("matches", len(pairs), len(pairs), "pairs of pictures")
+    progress("matches", len(pairs), len(pairs), "pairs of images")
 
 
 def _map(pycolmap: Any, count: int, folder: Path, database: Path, progress: Progress) -> list[Any]:
+    """COLMAP's models by incremental mapping."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = _threads()
     options.random_seed = SEED
@@ -208,12 +214,12 @@ def _map(pycolmap: Any, count: int, folder: Path, database: Path, progress: Prog
     def start() -> None:
         nonlocal registered
         registered = 2
-        progress("poses", registered, count, "pictures registered")
+        progress("poses", registered, count, "images registered")
 
     def step() -> None:
         nonlocal registered
         registered = min(registered + 1, count)
-        progress("poses", registered, count, "pictures registered")
+        progress("poses", registered, count, "images registered")
 
     out = database.with_suffix(".models")
     out.mkdir(exist_ok=True)
@@ -224,6 +230,7 @@ def _map(pycolmap: Any, count: int, folder: Path, database: Path, progress: Prog
 
 
 def _sparse_model(model: Any, index: dict[str, int]) -> SparseModel:
+    """A model of COLMAP, from the indices of images by their names; its pixel coordinates get integer centres."""
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: index[image.name])
     poses = np.tile(np.eye(4), (len(images), 1, 1))
     calibrations = np.tile(np.eye(3), (len(images), 1, 1))
@@ -264,7 +271,7 @@ def _opened(pycolmap: Any, path: Path) -> Generator[Any]:
 
 @contextmanager
 def _quiet(pycolmap: Any) -> Generator[None]:
-    """Nothing of COLMAP's log on standard error: what went wrong is raised, or said by who called."""
+    """Keep COLMAP's log off standard error. Errors are raised, and callers report them."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3
     try:
@@ -274,5 +281,5 @@ def _quiet(pycolmap: Any) -> Generator[None]:
 
 
 def _threads() -> int:
-    """Threads for COLMAP: as many as OMP_NUM_THREADS allows, otherwise all cores."""
+    """The number of threads for COLMAP: OMP_NUM_THREADS, otherwise -1, which means all cores."""
     return stated_threads() or -1

@@ -1,4 +1,4 @@
-"""Frames taken out of a video, the sharpest of each stretch."""
+"""Extract frames from a video: the sharpest of each interval."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["sharpness", "take_frames"]
 
-LOOKED_AT = 5  # frames of each stretch, of which the sharpest is taken
+LOOKED_AT = 5  # frames of each interval, of which the sharpest is taken
 QUALITY = 95  # of JPEG
-SMALL = 320  # pixels along the longer side, on which sharpness is judged
-BLURRED = 0.25  # of the median sharpness: frames below are left out
+SMALL = 320  # pixels along the longer side, at which sharpness is measured
+BLURRED = 0.25  # of the median sharpness: frames with less are left out
 
 
 def take_frames(path: Path, folder: Path, count: int, progress: Callable[[str, int, int, str], None]) -> int:
-    """Write the sharpest frame of each of `count` stretches of a video as JPEG files, in their order.
+    """Divide a video into `count` intervals and write the sharpest frame of each as a JPEG file.
 
     Args:
         path: the video.
-        folder: where the frames go.
-        count: how many.
-        progress: called as it goes on.
+        folder: in which the frames are written, as frame_0000.jpg and so on.
+        count: number of intervals.
+        progress: called during the work.
 
     Returns:
-        How many were written; blurred ones are left out.
+        The number of frames written. Frames with less than a quarter of the median sharpness are left out.
 
     Raises:
-        DataError: a file that is no video, or has too few frames.
+        DataError: a file that is not a video, or a video with too few frames.
     """
     reader = require("imageio_ffmpeg", "reads videos")
     try:
@@ -69,7 +69,7 @@ def take_frames(path: Path, folder: Path, count: int, progress: Callable[[str, i
 
 
 def sharpness(picture: np.ndarray) -> float:
-    """Variance of the Laplacian of a small grey version: less, the more a picture is blurred by motion.
+    """Variance of the Laplacian of a small greyscale copy of an image. Motion blur lowers it.
 
     Args:
         picture: (height, width, 3), 8 bits.

@@ -1,4 +1,4 @@
-"""Files to views: data sets and posed images of many layouts in, few-shot tasks out."""
+"""Readers of data sets and posed images in many layouts, which return views and few-shot tasks."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 __all__ = ["DataError", "Dataset", "mesh_path", "open_dataset", "read_channel", "read_task", "read_views"]
 
-_HOMES = {"Dataset": "dataset", "open_dataset": "dataset"}
-_HOMES |= {"mesh_path": "channels", "read_channel": "channels"}
-_HOMES |= {"read_task": "dataset", "read_views": "dataset"}
+_MODULES = {"Dataset": "dataset", "open_dataset": "dataset"}
+_MODULES |= {"mesh_path": "channels", "read_channel": "channels"}
+_MODULES |= {"read_task": "dataset", "read_views": "dataset"}
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for, so that writing files needs no torch."""
-    if name not in _HOMES:
+    """Import a public name at its first use, so that writing files does not import torch."""
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

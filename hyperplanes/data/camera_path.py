@@ -1,9 +1,9 @@
-"""Camera paths as nerfstudio's viewer and its Blender add-on write them: the cameras of the frames of a video.
+"""Camera paths that nerfstudio's viewer and its Blender add-on write: the cameras of the frames of a video.
 
-A path has `render_width`, `render_height`, `seconds`, and a list `camera_path` of frames: `camera_to_world`, 16 numbers
-row by row in OpenGL's axes, and `fov`, the vertical opening angle in degrees. nerfstudio's viewer writes it in the
-world of the model that it shows, which is turned, moved and scaled; dataparser_transforms.json beside the model's
-config.yml says how.
+A file has `render_width`, `render_height`, `seconds` and a list `camera_path` of frames. A frame has `camera_to_world`,
+16 numbers in row-major order with OpenGL axes, and `fov`, the vertical field of view in degrees. nerfstudio's viewer
+writes a path in the world of the trained model, which is rotated, translated and scaled relative to the data;
+dataparser_transforms.json beside the model's config.yml holds this transform.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class CameraPath:
 
     Attributes:
         cameras: one a frame, in the world of the posed images.
-        seconds: of the video.
-        notes: what the file asks for and is left out.
+        seconds: duration of the video.
+        notes: what the file asks for that is not supported.
     """
 
     cameras: PinholeCamera
@@ -57,17 +57,18 @@ def read_camera_path(
 
     Args:
         path: the JSON file.
-        transforms: nerfstudio's dataparser_transforms.json, which takes the data's world to that of the path; the path
-            is in the world of the data where absent.
-        scene: the content of the transforms.json of the data, whose `applied_transform` and `applied_scale` tell its
-            world from the one that `transforms` begins with.
-        origin: of the world in which the cameras are wanted, in that of the data (`Posed.origin`).
+        transforms: nerfstudio's dataparser_transforms.json, which maps the world of the data to that of the path. If
+            None, the path is in the world of the data.
+        scene: the content of the transforms.json of the data. Its `applied_transform` and `applied_scale` map the world
+            that `transforms` starts from to the world of the data.
+        origin: origin of the returned cameras' world, in the world of the data (`Posed.origin`).
 
     Returns:
-        Perspective cameras, principal points in the middle.
+        Perspective cameras with the principal point in the middle. The duration is that of 24 frames per second if the
+        file does not state it.
 
     Raises:
-        DataError: what no such file holds, another kind of camera, or too large a picture.
+        DataError: a malformed file, cameras that are not perspective, or too many frames or pixels.
     """
     path = Path(path)
     document = read_json(path)
@@ -86,7 +87,7 @@ def read_camera_path(
     poses, focal = np.zeros((len(frames), 4, 4)), np.zeros(len(frames))
     for index, frame in enumerate(frames):
         poses[index] = _pose(frame.get("camera_to_world"), path, index)
-        # the focal length of a vertical angle, in pixels
+        # the focal length in pixels, from the vertical field of view
         angle = _number(frame, "fov", path, f"frame {index}: degrees")
         if angle >= 180:
             raise DataError(path, f"frame {index}: a fov below 180 degrees", f"{angle:g}", EXPORT)
@@ -117,17 +118,16 @@ def _number(fields: Mapping[str, Any], name: str, path: Path, what: str) -> floa
 
 
 def _pose(values: Any, path: Path, index: int) -> npt.NDArray[np.float64]:
-    """A camera-to-world pose of 16 numbers row by row, or of rows."""
+    """A camera-to-world pose, from 16 numbers in row-major order or from a list of rows."""
     if isinstance(values, list) and len(values) == 16 and not any(isinstance(value, list) for value in values):
         values = [values[row : row + 4] for row in range(0, 16, 4)]
     return check_pose(values, path, f"{index} of camera_path")
 
 
 def _to_data(poses: npt.NDArray[np.float64], path: Path, scene: Mapping[str, Any]) -> npt.NDArray[np.float64]:
-    """Poses of nerfstudio's world in that of the data.
+    """Poses in the world of the data, from poses in nerfstudio's world.
 
-    nerfstudio takes a position p of the data to scale * (R p + t); its R and t are of the world before
-    `applied_transform` was.
+    nerfstudio maps a position p to scale * (R p + t), where p is in the world before `applied_transform`.
     """
     document = read_json(path)
     original = check_pose(document.get("transform"), path, "transform")

@@ -1,4 +1,4 @@
-"""What a native data set holds beside the pictures: depth, normals, surface coordinates, and the mesh."""
+"""What a native data set holds besides images: depth, normals, surface coordinates, and the mesh."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _REMEDY = "generate the data set with this channel"
 def read_channel(folder: str | Path, channel: str) -> Tensor:
     """One channel of all views of an object, in the order of its frames (not split into support and query).
 
-    depth: distance along the camera's z axis in world units, 0 where nothing is seen, float32 (view, height, width).
-    normals: unit vectors towards the camera in world axes; coordinates: surface points in world units; both float32
-    (view, height, width, 3), 0 where nothing is seen.
+    The channels are float32 and 0 where the ray hits nothing. "depth" is the distance along the camera's z axis in
+    world units, (view, height, width). "normals" are unit vectors in world axes that face the camera, and "coordinates"
+    are surface points in world units, both (view, height, width, 3).
 
     Args:
         folder: of the object.
@@ -37,7 +37,7 @@ def read_channel(folder: str | Path, channel: str) -> Tensor:
 
     Raises:
         ValueError: an unknown channel.
-        DataError: the object was generated without it, or the file is broken.
+        DataError: the object was generated without this channel, or the file is malformed.
     """
     if channel not in CHANNELS:
         raise ValueError(f"channel: expected one of {', '.join(CHANNELS)}, got {channel!r}")
@@ -52,7 +52,7 @@ def read_channel(folder: str | Path, channel: str) -> Tensor:
 
 
 def mesh_path(folder: str | Path) -> Path:
-    """The GLB file of an object's mesh, in the world that the cameras stand in.
+    """The GLB file of an object's mesh, in the world of its cameras.
 
     Args:
         folder: of the object.

@@ -1,4 +1,4 @@
-"""A data set of few-shot tasks, and the two functions that read a single scene."""
+"""A data set of few-shot tasks, and functions that read a single scene."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ from hyperplanes.views import Task, Views
 __all__ = ["Dataset", "Datasets", "locate_scene", "open_dataset", "open_datasets", "read_task", "read_views"]
 
 DEFAULT_BUDGET = 2 * 2**30
-EXAMPLES = Path(__file__).parent.parent / "examples"  # a folder a scene, by its name
+EXAMPLES = Path(__file__).parent.parent / "examples"  # one folder per packaged scene
 
 
 class Dataset:
-    """The objects of a folder, read when asked for and kept as 8-bit pictures while there is room.
+    """The objects of a data set, read on demand. An LRU cache keeps their 8-bit images.
 
     Args:
-        folder: a data set, a folder of posed scenes, or one of them, in a layout that `find_catalogue` knows.
-        budget: bytes of decoded pictures to keep in memory; the least recently used go first.
-        legacy: principal points of learnit's and the authors' layouts at W / 2 at integer pixel centres, as the code
-            that was published with these data has them, instead of at the middle of the pictures.
+        folder: a data set, a folder of posed scenes, or a single posed scene, in a layout that `find_catalogue`
+            recognises.
+        budget: size of the cache in bytes of decoded images.
+        legacy: place the principal points of learnit's and the HyperPlanes authors' layouts at W / 2 at integer pixel
+            centres, as the code published with these data does, instead of at the middle of the images.
 
     Raises:
-        DataError: nothing that is known lies there, or an object that is listed twice.
+        DataError: no known layout was found, an object is listed twice, or `legacy` was given for another layout.
     """
 
     def __init__(self, folder: str | Path, budget: int = DEFAULT_BUDGET, *, legacy: bool = False) -> None:
@@ -48,12 +49,12 @@ class Dataset:
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """What manifest.json says; empty where the layout has none."""
+        """The content of manifest.json. Without this file: the classes of the objects if known, otherwise empty."""
         return self._catalogue.manifest
 
     @property
     def skipped(self) -> tuple[str, ...]:
-        """A line about each split of which some objects are missing."""
+        """A message about each list of objects of which some were skipped."""
         return self._catalogue.skipped
 
     @property
@@ -81,7 +82,7 @@ class Dataset:
         return list(self._catalogue.splits[split])
 
     def class_of(self, name: str) -> str:
-        """The class of one object, as `generate` writes it into manifest.json; empty where that does not state it."""
+        """The class of one object, which `manifest` states; empty if it does not."""
         objects = self.manifest.get("objects")
         record = objects.get(name) if isinstance(objects, dict) else None
         stated = record.get("class") if isinstance(record, dict) else None
@@ -95,22 +96,22 @@ class Dataset:
             name: one of `names()`.
 
         Returns:
-            New tensors at every call; only the 8-bit pictures are kept. As `posed`, it raises DataError.
+            New tensors at every call, since only the 8-bit images are cached. Raises DataError as `posed` does.
         """
         return self.posed(name).task()
 
     @checked
     def posed(self, name: str) -> PosedTask:
-        """The support and query pictures of one object, 8 bits, shared between calls: not to be changed.
+        """The 8-bit support and query images of one object. Calls share them, so they must not be changed.
 
         Args:
             name: one of `names()`.
 
         Returns:
-            The pictures with their cameras. A UserWarning names what was left out, turned or scaled.
+            The images with their cameras. A UserWarning names what was left out, rotated or scaled.
 
         Raises:
-            DataError: no such object, or anything wrong with its files.
+            DataError: no such object, or a file of it is missing or invalid.
         """
         with self._lock:
             if (cached := self._cache.get(name)) is not None:
@@ -136,7 +137,7 @@ class Dataset:
 
 
 def _check_apart(folder: Path, splits: Mapping[str, Sequence[str]]) -> None:
-    """Check that every object is in one split, once: what is trained on may not be judged by."""
+    """Check that every object is in only one split, and once, so that none is used for training and evaluation."""
     seen: dict[str, str] = {}
     for split, names in splits.items():
         for name in names:
@@ -148,7 +149,7 @@ def _check_apart(folder: Path, splits: Mapping[str, Sequence[str]]) -> None:
 
 @checked
 def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET, *, legacy: bool = False) -> Dataset:
-    """A data set in any layout, or a single posed scene presented as one with one test task.
+    """A data set in any layout. A single posed scene becomes a data set with one test task.
 
     Args:
         path: a folder, or a transforms file. "example-car" comes with the package.
@@ -156,16 +157,16 @@ def open_dataset(path: str | Path, budget: int = DEFAULT_BUDGET, *, legacy: bool
         legacy: as in `Dataset`.
 
     Returns:
-        The data set; objects are read when asked for.
+        The data set, whose objects are read on demand. Raises DataError as `Dataset` does.
     """
     return Dataset(locate_scene(path), budget, legacy=legacy)
 
 
 class Datasets:
-    """Several data sets as one; the name of an object is that of its data set's folder, a slash, and its own.
+    """Several data sets as one. The name of an object is DATASET/OBJECT.
 
     Args:
-        parts: data sets by the name that their objects get.
+        parts: the data sets by their names.
     """
 
     def __init__(self, parts: Mapping[str, Dataset]) -> None:
@@ -173,7 +174,7 @@ class Datasets:
 
     @property
     def skipped(self) -> tuple[str, ...]:
-        """As `Dataset.skipped`, of all data sets."""
+        """The messages of `Dataset.skipped` of all data sets."""
         return tuple(line for data in self.parts.values() for line in data.skipped)
 
     @checked
@@ -182,7 +183,7 @@ class Datasets:
         return [f"{part}/{name}" for part, data in self.parts.items() for name in data.names(split)]
 
     def class_of(self, name: str) -> str:
-        """The class of one object; the name of its data set where that does not state it."""
+        """The class of one object; the name of its data set if that does not state the class."""
         part, _, own = name.partition("/")
         return self.parts[part].class_of(own) or part
 
@@ -191,7 +192,7 @@ class Datasets:
         """One object; as `Dataset.task`.
 
         Raises:
-            DataError: no such data set or object, or anything wrong with its files.
+            DataError: no such data set or object, or a file of it is missing or invalid.
         """
         part, _, own = name.partition("/")
         if part not in self.parts:
@@ -214,7 +215,7 @@ def open_datasets(
         The data set, or `Datasets` of several.
 
     Raises:
-        ValueError: no folder, or two of the same name.
+        ValueError: no folder, or two folders of the same name.
     """
     if not paths:
         raise ValueError("data: expected at least one folder, got none")
@@ -229,23 +230,21 @@ def open_datasets(
 
 @checked
 def read_views(path: str | Path, downscale: int | None = None, *, up: str | None = None) -> Views:
-    """All posed images of one scene, over white.
+    """All posed images of one scene, composited over white.
 
     Args:
-        path: a transforms*.json, or a folder that holds some, an SRN object's folder, a COLMAP model, a scene in the
-            layout of LLFF, IDR or NSVF, or the .npz of one object. Of a folder with transforms_train, _val and _test
-            files, all are read. "example-car" comes with the package.
-        downscale: reduce the images by this factor, averaging pixels; None reduces photographs of more than a megapixel
-            to at most one.
-        up: the direction that points up in the world of the files, which is turned so that it is y, as models expect:
-            an axis such as "z" or "-y", three numbers such as "0,0.1,1", or "auto": from how the cameras are held, y
-            where they do not tell. None leaves the world as it is, which is right where y is up, as `generate` writes
-            it.
+        path: a transforms*.json file, the .npz file of one object, or the folder of a scene in any layout that is
+            read, such as nerfstudio's, SRN's, COLMAP's, LLFF's, IDR's or NSVF's. If a folder has the files
+            transforms_train.json, _val and _test, all are read. "example-car" comes with the package.
+        downscale: reduce the images by this factor, averaging pixels. None reduces photographs to at most a megapixel.
+        up: the direction that points up in the world of the files. The scene is rotated so that it becomes y, as
+            models expect. An axis such as "z" or "-y", three numbers such as "0,0.1,1", or "auto": the direction that
+            the files state, otherwise the one that `guess_up` estimates from the cameras, otherwise y. None does not
+            rotate the scene, which is right if y is up, as in data sets that `generate` writes.
 
     Returns:
-        The views in the order of the files; masks where the files have alpha. Where pictures were left out, turned or
-        scaled, a UserWarning says which. As `recognise.read_posed`, it raises DataError, and ValueError for another
-        `up`.
+        The views in the order of the files, with masks if the files have alpha. A UserWarning names images that were
+        left out, rotated or scaled. Raises DataError as `recognise.read_posed` does, and ValueError for another `up`.
     """
     path = locate_scene(path)
     with malformed(path, "posed images of one scene"):
@@ -256,10 +255,10 @@ def read_views(path: str | Path, downscale: int | None = None, *, up: str | None
 
 
 def locate_scene(path: str | Path) -> Path:
-    """The path, or where a bare name stands for nothing else, the scene of that name that comes with the package.
+    """The path; for a bare name at which nothing exists, the path of the packaged scene of that name, if there is one.
 
     Args:
-        path: of posed images, or such as "example-car".
+        path: of posed images, or the name of a packaged scene such as "example-car".
     """
     path = Path(path)
     packaged = EXAMPLES / path.name
@@ -271,14 +270,14 @@ def read_task(path: str | Path, downscale: int | None = None, *, up: str | None 
     """The support and query views of one scene.
 
     Args:
-        path: a folder with transforms_train.json and transforms_test.json, or one transforms.json (whose
-            train_filenames and test_filenames decide, otherwise views alternate), or another layout of one scene.
+        path: a folder with transforms_train.json and transforms_test.json; or one transforms.json, which is split by
+            its train_filenames and test_filenames, or without these alternately; or another layout of one scene.
             "example-car" comes with the package.
         downscale: as in `read_views`.
         up: as in `read_views`.
 
     Returns:
-        The task; its name is the folder's. It warns and raises as `read_views`.
+        The task, named after the folder (or .npz file). Warns and raises as `read_views` does.
     """
     path = locate_scene(path)
     with malformed(path, "posed images of one scene"):
@@ -289,12 +288,13 @@ def read_task(path: str | Path, downscale: int | None = None, *, up: str | None 
 
 
 def _up_of(up: str, *parts: Views) -> str:
+    """The up direction that `read_views` describes."""
     if up != "auto":
         return up
     return parts[0].up or guess_up(camera.concatenate([part.cameras for part in parts])) or "y"
 
 
 def warn_of(notes: Sequence[str], path: str | Path) -> None:
-    """A UserWarning for each note of a reading."""
+    """Issue a UserWarning for each note of a reader."""
     for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=3)

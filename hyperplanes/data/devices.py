@@ -1,4 +1,4 @@
-"""Where to compute: the choice of a device, and tasks that lie on it."""
+"""The choice of a device, and data sets whose tasks are moved to it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ __all__ = ["TasksOnDevice", "choose_device"]
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of that name; "auto" is a GPU where there is one.
+    """The device of that name; "auto" is a GPU if there is one, otherwise the CPU.
 
     Raises:
-        ValueError: a device that torch does not have here.
+        ValueError: PyTorch has no such device on this machine.
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device).item()  # which a meta tensor has none of
+        torch.zeros(1, device=device).item()  # fails on the device meta, whose tensors have no data
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"device: expected auto, cpu or one that torch has here, got {name!r} ({reason})") from None
@@ -32,11 +32,12 @@ def choose_device(name: str) -> torch.device:
 
 @dataclass(frozen=True)
 class TasksOnDevice(TaskWrapper):
-    """Tasks whose views lie on a device, in a world with y up.
+    """Tasks whose views are moved to a device and rotated into a world with y up.
 
     Attributes:
-        device: where they go.
-        up: the axis that points up in the data's world; where None, as the files of each object say, or y.
+        device: to which the views are moved.
+        up: the direction that points up in the world of the data. None takes the one that the files of each object
+            state, or y.
     """
 
     device: torch.device

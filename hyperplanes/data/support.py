@@ -1,4 +1,4 @@
-"""Tasks with other support or query views than their data set states, or with a sphere that its files do not state."""
+"""Data sets whose tasks have other support or query views, or a given scene sphere."""
 
 from __future__ import annotations
 
@@ -23,9 +23,8 @@ Choice = Literal["first", "farthest", "random"]
 class WithSupport(TaskWrapper):
     """Tasks with another number of support views.
 
-    Where there are more than an object has, its query views follow, in their order: support and query unified, as the
-    paper does to have up to 50 ImagePlanes. They stay query views, too, so a method is then judged by views that it was
-    shown.
+    If an object has fewer support views, its first query views are added to them, as the paper does to have up to 50
+    ImagePlanes. The added views also stay query views, so a method is then evaluated on views that it was given.
 
     Attributes:
         count: support views of every object.
@@ -43,7 +42,7 @@ class WithSupport(TaskWrapper):
             raise ValueError(f"support: expected at least 1 view, got {self.count}")
 
     def change(self, task: Task) -> Task:
-        """The task with `count` support views; ValueError where the object has fewer views."""
+        """The task with `count` support views; raises ValueError if the object has fewer views in total."""
         total = len(task.support) + len(task.query)
         if self.count > total:
             raise ValueError(
@@ -66,20 +65,21 @@ class WithSupport(TaskWrapper):
 
 @dataclass(frozen=True)
 class SingleView(TaskWrapper):
-    """Tasks of which one support view is left, always the same of an object."""
+    """Tasks with one support view, always the same one for an object."""
 
     def change(self, task: Task) -> Task:
-        """The task with the view that the name of the object decides on."""
+        """The task with one of its support views, chosen by a checksum of the object's name."""
         chosen = zlib.crc32(task.name.encode()) % len(task.support)
         return replace(task, support=task.support[[chosen]])
 
 
 @dataclass(frozen=True)
 class WithBounds(TaskWrapper):
-    """Tasks whose scene is held by a given sphere, whatever their masks say.
+    """Tasks with a given scene sphere, in place of the one that files state or masks give.
 
     Attributes:
-        bounds: the sphere; rays of constant span begin and end at the distance of its centre minus and plus its radius.
+        bounds: the sphere. Rays with constant near and far begin and end at the distance of its centre minus and plus
+            its radius.
     """
 
     bounds: Sphere
@@ -111,18 +111,19 @@ class FewerQueries(TaskWrapper):
 
 @dataclass(frozen=True)
 class Shown(TaskWrapper):
-    """Tasks of which some views are shown, those that stand farthest apart, and some query views are kept back.
+    """Tasks whose support views are those farthest apart, and whose query views are some of the original ones.
 
     Attributes:
-        count: views that are shown, support and query alike, at most all but those that are kept back.
-        query: how many of the query views are kept back, evenly chosen.
+        count: number of support views. They are chosen from all original support and query views except the new query
+            views; if there are fewer, all are taken.
+        query: number of query views, evenly spaced among the original ones.
     """
 
     count: int
     query: int
 
     def change(self, task: Task) -> Task:
-        """The task with the views that are farthest apart, the first one first."""
+        """The task with the views that are farthest apart as support, beginning with the first view."""
         asked = _evenly(self.query, len(task.query))
         rest = [index for index in range(len(task.query)) if index not in asked.tolist()]
         views = join_views(task.support, task.query[rest])
@@ -132,18 +133,18 @@ class Shown(TaskWrapper):
 
 @dataclass(frozen=True)
 class Inputs(TaskWrapper):
-    """Tasks whose support views are those at given places in the order of their names, whose query views the others.
+    """Tasks whose support views have given positions in the order of view names; all other views are query views.
 
-    Protocols that name their input views are followed with it: views 64, or 64 and 128, of SRN's 251.
+    It serves protocols that prescribe their input views, such as view 64, or 64 and 128, of SRN's 251.
 
     Attributes:
-        places: of the support views, from 0.
+        places: positions of the support views, from 0.
     """
 
     places: tuple[int, ...]
 
     def change(self, task: Task) -> Task:
-        """The task with these support views; ValueError where the object has no such view."""
+        """The task with these support views; raises ValueError if the object has no such view."""
         views = join_views(task.support, task.query)
         order = sorted(range(len(views)), key=lambda index: views.names[index]) if views.names else range(len(views))
         if not all(0 <= place < len(views) for place in self.places):

@@ -1,4 +1,4 @@
-"""Views of a world with another axis up, brought into ours: y up, as models are trained."""
+"""Rotate views from a world with another up direction into one with y up, as in the training data of models."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from hyperplanes.views import Task, Views
 __all__ = ["UPS", "guess_up", "stated_up", "upright", "upright_cameras", "upright_task", "y_up_from"]
 
 UPS = ("y", "z", "x", "-y", "-z", "-x")
-"""Axes that may be up in a world; three numbers with commas between them are another direction."""
+"""Axes that may point up in a world. Another direction is written as three numbers with commas between them."""
 
-LEVEL = 0.1  # sine of the tilt, root mean square over the cameras, up to which they count as held level
+LEVEL = 0.1  # largest root mean square, over the cameras, of the sine of their roll for them to count as level
 
 
 def guess_up(cameras: PinholeCamera) -> str | None:
-    """The direction that is up in the world, as people and programs hold cameras: level, and not upside down.
+    """An estimate of the up direction of the world, assuming that the cameras are level and not upside down.
 
-    The horizontal axis of a level camera is perpendicular to it. An axis of the world goes first; otherwise it is the
-    direction that all horizontal axes are most nearly perpendicular to.
+    The x axis of a level camera is perpendicular to the up direction. The axes of the world are tried first. If none
+    fits, the result is the direction that is most nearly perpendicular to the x axes of all cameras.
 
     Returns:
-        One of UPS, or three numbers as `y_up_from` takes them; None where the cameras do not tell.
+        One of UPS, or three numbers as `y_up_from` takes them; None if the cameras do not determine the direction.
 
     >>> guess_up(camera.pinhole(camera.symmetric_intrinsics(4, 4, 0.7), camera.orbit(9, 3.0), 4, 4))
     'y'
@@ -54,13 +54,13 @@ def guess_up(cameras: PinholeCamera) -> str | None:
 
 
 def stated_up(document: dict[str, Any], path: Path) -> str | None:
-    """The "up" of a transforms.json, None where it does not say.
+    """The field "up" of a transforms.json; None if there is none.
 
     Returns:
         A direction as `y_up_from` takes it.
 
     Raises:
-        DataError: something else.
+        DataError: the field is not such a direction.
     """
     up = document.get("up")
     if up is None:
@@ -73,10 +73,10 @@ def stated_up(document: dict[str, Any], path: Path) -> str | None:
 
 
 def _direction(up: str) -> Float[Tensor, " 3"]:
-    """The unit vector that a name of UPS, or three numbers, stand for.
+    """The unit vector of one of UPS or of three numbers.
 
     Raises:
-        ValueError: neither.
+        ValueError: neither of these.
     """
     if up in UPS:
         axis = torch.zeros(3, dtype=torch.float64)
@@ -93,13 +93,13 @@ def _direction(up: str) -> Float[Tensor, " 3"]:
 
 
 def y_up_from(up: str) -> Float[Tensor, "4 4"]:
-    """The smallest rotation that takes a world with that direction up to one with y up.
+    """The smallest rotation from a world with that up direction to one with y up.
 
     Args:
         up: one of UPS, or three numbers with commas between them.
 
     Returns:
-        A rigid transform in float64; about x where `up` is z or -y. Another `up` is a ValueError.
+        A rigid transform in float64, which rotates about x if `up` is z or -y. Raises ValueError for another `up`.
 
     >>> (y_up_from("z") @ torch.tensor([1.0, 2.0, 3.0, 1.0], dtype=torch.float64)).tolist()
     [1.0, 3.0, -2.0, 1.0]
@@ -116,14 +116,14 @@ def y_up_from(up: str) -> Float[Tensor, "4 4"]:
 
 
 def upright(views: Views, up: str) -> Views:
-    """The same pictures in a world with y up: cameras and bounds are turned together, so every ray sees what it saw.
+    """The same views in a world with y up. Cameras and bounds are rotated together.
 
     Args:
-        views: of a world in which `up` points up.
+        views: in a world in which `up` points up.
         up: as in `y_up_from`.
 
     Returns:
-        The views; images and masks are shared with the ones given.
+        The views, which share their images and masks with the given ones.
     """
     turn = y_up_from(up)
     if up == "y":
@@ -134,7 +134,7 @@ def upright(views: Views, up: str) -> Views:
 
 
 def upright_cameras(cameras: PinholeCamera, up: str) -> PinholeCamera:
-    """The same cameras in a world with y up, as `upright` turns those of views."""
+    """The same cameras in a world with y up, rotated as by `upright`."""
     pose = camera.camera_from_world(cameras)
     return camera.with_poses(cameras, pose @ y_up_from(up).T.to(pose))  # camera from old world, old world from new
 

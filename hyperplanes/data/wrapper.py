@@ -1,4 +1,4 @@
-"""Tasks that are those of another data set, each changed in one way."""
+"""A data set whose tasks are those of another data set with a change."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ __all__ = ["TaskWrapper"]
 
 @dataclass(frozen=True)
 class TaskWrapper(ABC):
-    """The objects, splits and classes of a data set, whose tasks are changed when they are read.
+    """The objects, splits and classes of another data set, whose tasks are changed when they are read.
 
     Attributes:
-        data: where the tasks come from; a wrapper itself, perhaps.
+        data: the other data set, which may be a wrapper itself.
     """
 
     data: Tasks
 
     @abstractmethod
     def change(self, task: Task) -> Task:
-        """The task that is shown in the place of one of `data`."""
+        """The changed task that replaces a task of `data`."""
 
     def names(self, split: str) -> Sequence[str]:
         """The objects of a split."""

@@ -166,8 +166,8 @@ def test_masks_that_came_with_photographs_stay_as_they_are_beside_others(ball_se
     for row in range(8):
         np.testing.assert_array_equal(found[row], damaged[row])
     assert overlap(found[9], masks[9] > 0.5) > 0.9
-    mended = "they were mended by what these show together"
-    said = [f"1 masks contradict the others, {done}" for done in ("look at them: 2", f"{mended}: 9")]
+    corrected = "they were corrected by what the others show"
+    said = [f"1 masks contradict the others, {done}" for done in ("check them: 2", f"{corrected}: 9")]
     assert [note for note in captured.notes if "contradict" in note] == said
 
 

@@ -202,8 +202,8 @@ def test_masks_that_nothing_finds_are_refused_before_poses_are_searched_for(mask
     ("mask", "name", "said"),
     [
         ("given", None, "expected photographs with alpha, or a folder masks/ beside them, found neither"),
-        ("given", "object_0.png", "masks: expected masks named as the pictures, found none of them for 0.png"),
-        ("auto", "object_0.png", "masks: expected masks named as the pictures, found none of them for 0.png"),
+        ("given", "object_0.png", "masks: expected masks named as the images, found none for 0.png"),
+        ("auto", "object_0.png", "masks: expected masks named as the images, found none for 0.png"),
     ],
 )
 def test_masks_that_are_missing_are_asked_for_before_poses_are_searched_for(

@@ -259,7 +259,7 @@ def test_a_lens_with_four_radial_coefficients():
     lens = brown_lens([-0.09, -0.08, 0.12, -0.076], [0.0, 0.0], 0.9, "")
     wanted = seen(*radii.T, -0.09, -0.08, 0.12, -0.076, 0.0, 0.0)
     assert np.abs(distort(radii, lens) - wanted).max() < 1e-5
-    with pytest.raises(DataError, match="expected a lens that OpenCV's model can show, found k4 = 50"):
+    with pytest.raises(DataError, match="expected distortion that OpenCV's model can fit, found k4 = 50"):
         brown_lens([-9.0, 30.0, -70.0, 50.0], [0.0, 0.0], 3.0, "cameras.xml")
 
 

@@ -63,7 +63,7 @@ def test_llff(tmp_path):
     assert len(read_task(tmp_path).support) == 3
     assert open_dataset(tmp_path).names("test") == [tmp_path.name]
     (tmp_path / "images_2/IMG_3.JPG").unlink()
-    with pytest.raises(DataError, match=r"poses_bounds.npy: expected 6 pictures, one a row, found 5 in images_2"):
+    with pytest.raises(DataError, match=r"poses_bounds.npy: expected 6 images, one per row, found 5 in images_2"):
         read_views(tmp_path)
     np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 16)))
     with pytest.raises(DataError, match=r"expected an array \(view, 17\), found float64 \(3, 16\)"):
@@ -81,7 +81,7 @@ def test_masks_beside_the_pictures_of_llff(tmp_path):
     assert masks is not None
     assert (masks.amax((1, 2, 3)) * 255).round().tolist() == [40 * index for index in range(VIEWS)]
     (tmp_path / "masks/IMG_3.png").unlink()
-    with pytest.raises(DataError, match=r"masks: expected a mask for each of the 6 pictures, found 5, none for IMG_3"):
+    with pytest.raises(DataError, match=r"masks: expected a mask for each of the 6 images, found 5, none for IMG_3"):
         read_views(tmp_path)
 
 
@@ -127,10 +127,10 @@ def test_idr(tmp_path, name):
     renamed = read_views(tmp_path).masks
     assert (renamed.amax((1, 2, 3)) * 255).round().tolist() == [40 * index for index in range(VIEWS)]
     (tmp_path / "mask/005.png").rename(tmp_path / "mask/five.png")
-    with pytest.raises(DataError, match="mask: expected masks named as the pictures, found none of them for 000000"):
+    with pytest.raises(DataError, match="mask: expected masks named as the images, found none for 000000"):
         read_views(tmp_path)
     (tmp_path / "image/000005.png").unlink()
-    with pytest.raises(DataError, match=rf"{name}: expected 6 or more pictures, one a world_mat, found 5"):
+    with pytest.raises(DataError, match=rf"{name}: expected 6 or more images, one per world_mat, found 5"):
         read_views(tmp_path)
 
 

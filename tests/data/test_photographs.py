@@ -55,7 +55,7 @@ def test_pictures_are_turned_where_the_stated_size_says_so(scene, tmp_path, orie
         jpeg(tmp_path / frame["file_path"], stored, orientation)
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     if orientation >= 5:
-        with pytest.warns(UserWarning, match="8 pictures turned as their EXIF orientation says: images/000.jpg"):
+        with pytest.warns(UserWarning, match="8 images rotated by their EXIF orientation: images/000.jpg"):
             views = read_views(tmp_path)
     else:
         views = read_views(tmp_path)  # as COLMAP and nerfstudio: the pixels as they are stored
@@ -74,14 +74,14 @@ def test_pictures_are_turned_where_the_stated_size_says_so(scene, tmp_path, orie
     [
         (
             {"w": 24, "h": 32},
-            r"000\.png: expected the shape of the 24 x 32 pixels that transforms.json states, found 32",
+            r"000\.png: expected the aspect ratio of the 24 x 32 pixels that transforms.json states, found 32",
         ),
-        ({"w": 64, "h": 64}, "expected the shape of the 64 x 64 pixels"),
-        ({"is_fisheye": True}, "expected perspective cameras, without is_fisheye, found it set; undistort"),
-        ({"ortho": True}, "without ortho, found it set"),
+        ({"w": 64, "h": 64}, "expected the aspect ratio of the 64 x 64 pixels"),
+        ({"is_fisheye": True}, "expected perspective cameras, found is_fisheye set; undistort"),
+        ({"ortho": True}, "found ortho set"),
         (
             {"k2": -3690.0},
-            "frame images/000.png: expected a lens that shows every pixel once, found k2 = -3690, which fold",
+            "frame images/000.png: expected a lens that maps one direction to each pixel, found k2 = -3690, which fold",
         ),
     ],
 )
@@ -99,9 +99,7 @@ def test_masks_of_a_folder_are_found_by_name(scene, tmp_path):
         Image.fromarray(picture[..., 3]).save(tmp_path / "masks" / name)
     assert torch.allclose(read_views(folder).images, scene.over_white(), atol=1e-6)
     (tmp_path / "masks/003.png").unlink()
-    with pytest.raises(
-        DataError, match=r"masks: expected a mask for each of the 8 pictures, found 7, none for 003.png"
-    ):
+    with pytest.raises(DataError, match=r"masks: expected a mask for each of the 8 images, found 7, none for 003.png"):
         read_views(folder)
 
 
@@ -110,7 +108,7 @@ def test_frames_that_are_missing_are_left_out_and_named(scene, tmp_path):
     folder = scene.write(tmp_path, document)
     for name in (scene.names[1], scene.names[6]):
         (tmp_path / name).unlink()
-    said = "6 of 8 frames have a picture, 2 are missing: images/001.png, images/006.png"
+    said = "6 of 8 frames have an image, 2 are missing: images/001.png, images/006.png"
     with pytest.warns(UserWarning, match=re.escape(said)):
         task = read_task(folder)
     assert task.support.names == tuple(scene.names[at] for at in (0, 2, 3, 4))
@@ -126,7 +124,7 @@ def test_pictures_of_several_sizes_become_one(scene, tmp_path):
         with Image.open(tmp_path / name) as image:
             large = image.resize((96, 72), Image.Resampling.BICUBIC)
         large.save(tmp_path / name)
-    with pytest.warns(UserWarning, match="2 pictures of other sizes scaled to 32 x 24 pixels"):
+    with pytest.warns(UserWarning, match="2 images of other sizes scaled to 32 x 24 pixels"):
         views = read_views(folder)
     assert len(views) == 8
     assert max(balls(views, views.masks[:, 0] > 0.5)) < 0.6
@@ -139,7 +137,7 @@ def test_portraits_among_landscapes_keep_their_geometry(scene, tmp_path):
     upright = type(scene)(size=(40, 30))
     for at in (0, 4, 6):
         Image.fromarray(upright.pictures[at]).save(tmp_path / scene.names[at])
-    with pytest.warns(UserWarning, match="3 pictures of other sizes scaled to 32 x 24 pixels"):
+    with pytest.warns(UserWarning, match="3 images of other sizes scaled to 32 x 24 pixels"):
         views = read_views(folder)
     focal = camera.intrinsics(views.cameras)[:, [0, 1], [0, 1]].numpy()
     np.testing.assert_allclose(focal[1], scene.matrix[0, 0], rtol=1e-6)

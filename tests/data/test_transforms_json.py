@@ -180,15 +180,15 @@ def test_no_picture_is_both_shown_and_asked_for(scene, tmp_path):
         (tmp_path / f"files/transforms_{half}.json").write_text(json.dumps(document | {"frames": frames}))
     (tmp_path / "files/transforms.json").unlink()
     for folder, support, query, note in (
-        ("lists", names[:5], names[5:], f"1 frames left out, whose pictures are listed before: {names[4]}"),
-        ("twice", names[::2], names[1::2], f"8 frames left out, whose pictures are listed before: {', '.join(names)}"),
-        ("files", names[:6], names[6:], "1 frames left out, whose pictures are listed before: images/link.png"),
+        ("lists", names[:5], names[5:], f"1 frames left out, whose images earlier frames list: {names[4]}"),
+        ("twice", names[::2], names[1::2], f"8 frames left out, whose images earlier frames list: {', '.join(names)}"),
+        ("files", names[:6], names[6:], "1 frames left out, whose images earlier frames list: images/link.png"),
     ):
         task = read_posed_task(tmp_path / folder)
         assert (task.support.names, task.query.names) == (tuple(support), tuple(query))
         assert task.notes == (note,)
     (tmp_path / "files/transforms_test.json").write_text((tmp_path / "files/transforms_train.json").read_text())
-    with pytest.raises(DataError, match="found 6 to train and 0 to test on; .* each in one split alone"):
+    with pytest.raises(DataError, match="found 6 to train and 0 to test on; .* each in only one split"):
         read_task(tmp_path / "files")
 
 

@@ -31,7 +31,7 @@ def test_missing_and_empty_folders(tmp_path):
 
 def test_of_a_single_view_none_can_be_left_out(scene, tmp_path):
     one = type(scene)(views=1).write(tmp_path)
-    refused(read_task, one, match="expected two views or more, found 1; add views; `render --all-views` shows")
+    refused(read_task, one, match="expected two views or more, found 1; add views, or use `render --all-views`")
     assert len(read_views(one)) == 1
 
 
@@ -64,7 +64,7 @@ def test_missing_pictures(scene, tmp_path):
     scene.write(tmp_path)
     for name in scene.names[2:5]:
         (tmp_path / name).unlink()
-    refused(read_views, tmp_path, match=r"of its 8 frames, or of two thirds of them, found 5 \(.*002\.png and 2 others")
+    refused(read_views, tmp_path, match=r"at least two thirds of its 8 frames, found 5 \(.*002\.png and 2 others")
 
 
 def test_a_missing_picture_of_a_generated_object(scene, tmp_path):
@@ -78,7 +78,7 @@ def chunk(kind, data):
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-@pytest.mark.parametrize(("side", "found"), [(200_000, "far more"), (10_000, "10000 x 10000")])
+@pytest.mark.parametrize(("side", "found"), [(200_000, "more"), (10_000, "10000 x 10000")])
 def test_an_absurd_size_is_refused_before_decoding(scene, tmp_path, side, found):
     header = struct.pack(">IIBBBBB", side, side, 8, 6, 0, 0, 0)
     bomb = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(100)))

@@ -1,1 +1,1 @@
-"""What of a photograph is the object: each way a function from pixels to opacity."""
+"""Masks of the object in photographs. Each method is a function from an image to its opacity."""

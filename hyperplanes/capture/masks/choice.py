@@ -1,4 +1,4 @@
-"""Which way masks are found."""
+"""The choice of a masking method."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from hyperplanes.capture.sparse_model import SparseModel
 __all__ = ["MASKS", "Masker", "check_mask", "choose_masker"]
 
 MASKS = ("auto", "given", "colour", "network", "grabcut", "none")
-"""Ways to find masks; a command with {image} and {mask} in it is another."""
+"""The names of masking methods. A command that contains {image} and {mask} is another."""
 
 Masker = Callable[[np.ndarray, int], np.ndarray]
-"""From a picture (height, width, 3) and the number of its camera to opacity (height, width) in [0, 1]."""
+"""From an image (height, width, 3) and the index of its camera to opacity (height, width) in [0, 1]."""
 
-LOOKED_AT = 12  # pictures by which a background is called plain
+LOOKED_AT = 12  # about how many images are checked for a plain background
 
 
 def check_mask(name: str) -> None:
-    """Refuse a masking method that cannot work here, before anything else is done.
+    """Check that a masking method can work, before anything else is done.
 
     Args:
         name: one of MASKS, or a command.
 
     Raises:
-        ValueError: another name, a package that is missing, or a command without {image} and {mask} or whose program
-            is not installed.
+        ValueError: another name, a missing package, or a command that lacks {image} and {mask} or whose program is not
+            installed.
     """
     if name == "network":
         SalientObject()
     elif name == "grabcut":
-        require("cv2", "cuts masks out of pictures")
+        require("cv2", "finds masks by GrabCut")
     elif name not in MASKS:
         if " " not in name and "{" not in name:
             raise ValueError(f"--mask: expected one of {', '.join(MASKS)}, or a command, got {name!r}")
@@ -45,18 +45,21 @@ def check_mask(name: str) -> None:
 
 
 def choose_masker(name: str, model: SparseModel, pictures: Sequence[np.ndarray]) -> tuple[Masker, str]:
-    """A way to find masks, and its name.
+    """A masking method, and its name for messages.
 
-    `auto` takes the colour of the background where it is plain, the network where its packages are installed,
-    otherwise GrabCut.
+    `auto` chooses the colour of the background if it is plain, otherwise the network if its packages are installed,
+    otherwise GrabCut. So does `given`, for images that came without a mask.
 
     Args:
-        name: one of MASKS but none, or a command, which `check_mask` lets pass.
+        name: one of MASKS except none, or a command; `check_mask` must accept it.
         model: of structure from motion.
-        pictures: one a camera.
+        pictures: the undistorted images, one per camera.
+
+    Returns:
+        The function, and the name.
 
     Raises:
-        ValueError: nothing that `auto` could take is installed.
+        ValueError: the background is not plain, and no other method that `auto` could choose is installed.
     """
     if name in ("auto", "given"):
         step = max(1, len(pictures) // LOOKED_AT)

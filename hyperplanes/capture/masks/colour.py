@@ -1,4 +1,4 @@
-"""Masks in front of a plain background, such as a green screen or a sheet of paper, by its colour."""
+"""Masks by the colour of a plain background, such as a green screen or a sheet of paper."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ from hyperplanes.capture.masks.regions import cleaned, connected_regions
 
 __all__ = ["PlainBackground", "is_plain"]
 
-BORDER = 0.03  # of the shorter side
+BORDER = 0.03  # of the shorter side: width of the border
 NEAR, FAR = 10.0, 18.0  # distances in CIE Lab up to which a pixel is background, and from which on it is the object
-PLAIN_BORDER, PLAIN_PICTURES = 0.7, 0.8  # of the border, and of the pictures, that have to be plain
+PLAIN_BORDER, PLAIN_PICTURES = 0.7, 0.8  # least shares of the border and of the images that have to be plain
 
 
 class PlainBackground:
-    """All that is not of the colour of the picture's border and not shut in by the object."""
+    """Masks of all pixels whose colour differs from that of the image's border.
+
+    Regions of about the border's colour that the object encloses belong to it, unless they match the colour closely, as
+    holes do.
+    """
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
         """Opacity in [0, 1]."""
@@ -28,12 +32,12 @@ class PlainBackground:
         labels, _ = connected_regions(opacity < 0.5)
         outer = np.unique(labels[_border(labels.shape)])
         reached = np.isin(labels, outer[outer > 0])
-        enclosed = (opacity < 0.5) & ~reached & (distance > NEAR / 2)  # a hole shows the very colour of the background
+        enclosed = (opacity < 0.5) & ~reached & (distance > NEAR / 2)  # holes are closer
         return cleaned(np.where(enclosed, 1.0, opacity))
 
 
 def is_plain(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bool:
-    """Whether most pictures have borders of one colour, each its own."""
+    """Whether at least 80 % of the images have a border of one colour, which may differ between images."""
     plain = 0
     for picture in pictures:
         lab = rgb2lab(picture[:: max(1, min(picture.shape[:2]) // 200), :: max(1, min(picture.shape[:2]) // 200)])
@@ -43,7 +47,7 @@ def is_plain(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bool:
 
 
 def _border(size: tuple[int, ...]) -> np.ndarray:
-    """Which pixels are within BORDER of the picture's border."""
+    """Which pixels belong to the border, of a width of BORDER."""
     width = max(1, round(BORDER * min(size[:2])))
     result = np.ones(size[:2], bool)
     result[width:-width, width:-width] = False
@@ -51,4 +55,5 @@ def _border(size: tuple[int, ...]) -> np.ndarray:
 
 
 def _border_colour(lab: np.ndarray) -> np.ndarray:
+    """The median colour of the border."""
     return np.median(lab[_border(lab.shape[:2])], axis=0)

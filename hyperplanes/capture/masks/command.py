@@ -1,4 +1,4 @@
-"""Masks by a program of the user's own, such as rembg or a wrapper of SAM."""
+"""Masks by a program that the user names, such as rembg or a wrapper of SAM."""
 
 from __future__ import annotations
 
@@ -18,15 +18,18 @@ from hyperplanes.utilities.files import DataError
 
 __all__ = ["Command"]
 
-LONGEST = 600  # seconds for a picture
+LONGEST = 600  # seconds: time limit for one image
 
 
 @dataclass(frozen=True)
 class Command:
-    """A program that reads a picture and writes its mask, or the picture with alpha.
+    """A program that reads an image and writes its mask, or the image with alpha.
 
     Attributes:
-        line: with {image} and {mask} in place of the two files; no shell reads it.
+        line: the command, with {image} and {mask} for the paths of the two files. It is run without a shell.
+
+    Raises:
+        ValueError: {image} or {mask} is missing, or the program is not installed.
     """
 
     line: str
@@ -42,7 +45,12 @@ class Command:
             raise ValueError(f"--mask: expected a program that is installed, found none called {program!r}")
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
-        """Opacity in [0, 1]."""
+        """Opacity in [0, 1].
+
+        Raises:
+            ValueError: the program fails, or takes longer than ten minutes.
+            DataError: the mask has another size than the image.
+        """
         with tempfile.TemporaryDirectory() as folder:
             image, mask = Path(folder) / "image.png", Path(folder) / "mask.png"
             image.write_bytes(encode_png(picture))
@@ -64,5 +72,5 @@ class Command:
         if opacity.shape != picture.shape[:2]:
             found = f"{opacity.shape[1]} x {opacity.shape[0]}"
             size = f"{picture.shape[1]} x {picture.shape[0]} pixels"
-            raise DataError("--mask", f"a mask of {size}, as the picture", found, "correct the command")
+            raise DataError("--mask", f"a mask of {size}, as the image", found, "correct the command")
         return opacity / 255.0

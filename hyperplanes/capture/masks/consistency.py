@@ -1,4 +1,4 @@
-"""Masks of one object seen from many sides must agree: each is judged by the visual hull of all others."""
+"""Check the masks of one object against each other: each is compared with the visual hull of all others."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from hyperplanes.geometry.rays import Sphere
 
 __all__ = ["Agreement", "agree"]
 
-COARSE, FINE = 80, 120  # voxels an axis, of the hull that is searched and of the one that masks are compared with
-LONGEST = 240  # pixels of the masks that are compared
-FEWEST = 8  # views, below which masks are not judged
-SEEN = 0.25  # of the views must show a place within their borders for it to belong to the object
+COARSE, FINE = 80, 120  # voxels per axis: of the first hull, and of the one that masks are compared with
+LONGEST = 240  # pixels along the longer side of the masks that are compared
+FEWEST = 8  # views; with fewer, masks are not compared
+SEEN = 0.25  # of the views: the least share that must show a voxel within their borders
 MOST_VOTES = 0.125  # of the views
-SETTLED = 0.01  # of intersection over union, by which more votes must be better
-ZOOM = 1.15  # times the radius of the hull: where it is judged again
-DEEP = 0.05  # of the square root of an area: differences thinner than that are the hull's own
-NEIGHBOUR = np.deg2rad(30)  # within which others must look, from opposite sides, for a mask to be filled
-DISAGREES = 0.05  # of the object's area
+SETTLED = 0.01  # least gain in intersection over union for which more votes are taken
+ZOOM = 1.15  # radii of the first hull: the sphere in which it is carved again
+DEEP = 0.05  # of the square root of the object's area: the radius of the disc that a difference must contain
+NEIGHBOUR = np.deg2rad(30)  # a mask is filled only if cameras within this angle look from opposite sides of its camera
+DISAGREES = 0.05  # of the object's area: masks with larger differences contradict the others
 
 Mask = Float[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Masks after they were compared.
+    """Masks after the comparison.
 
     Attributes:
-        masks: one a camera; parts that contradict the others are filled or taken away.
-        disagreement: for each camera, the area that was wrong, of that of the object.
-        votes: how many masks had to rule a place out.
-        hull: what they show together, None where they show nothing.
+        masks: one per camera. Parts that contradict the other masks are filled or removed.
+        disagreement: for each camera, the area of these parts relative to the area of the object.
+        votes: number of masks that had to rule a voxel out.
+        hull: the visual hull of all masks, None if it is empty.
     """
 
     masks: list[Mask]
@@ -56,12 +56,12 @@ class Agreement:
 
     @property
     def sphere(self) -> Sphere | None:
-        """The sphere around the hull, None where there is none."""
+        """The sphere around the hull, None without a hull."""
         return None if self.hull is None else _ball(self.hull)
 
     @property
     def wrong(self) -> list[int]:
-        """The cameras whose mask contradicted the others."""
+        """The indices of cameras whose masks contradict the others."""
         return np.flatnonzero(self.disagreement > DISAGREES).tolist()
 
 
@@ -71,37 +71,39 @@ def agree(
     sphere: Sphere,
     pictures: Sequence[UInt8[np.ndarray, "height width 3"]] | None = None,
 ) -> Agreement:
-    """Compare each mask with the silhouette of the hull of all others, and mend what they contradict.
+    """Compare each mask with the silhouette of the visual hull of all others, and correct what contradicts it.
 
-    A place belongs to the hull where fewer than `votes` masks rule it out, and where a quarter of the pictures show it
-    within their borders. The number of votes is the one with which the silhouettes of the hull agree best with the
-    masks (median over the views of intersection over union): one with masks that agree, at most one for every eight
-    views.
+    A voxel belongs to the hull if fewer than `votes` masks rule it out and at least a quarter of the images show it
+    within their borders. `votes` is the number for which the silhouettes of the hull agree best with the masks, by the
+    median intersection over union of the views. It is 1 if the masks agree, and at most one per eight views.
 
-    The hull of the others is larger than the object by what only this view sees past, a thin seam where views are
-    many. So only differences that a disc fits into count, and a mask is filled only where other cameras look from
-    nearly the same side, to the left and to the right of it.
+    The hull of the others is larger than the object by the voxels that only this view rules out. With many views these
+    form a thin layer, so only differences into which a disc fits count. A mask is filled only if cameras near its own
+    look from opposite sides of it, so that the hull is tight there.
 
-    Where masks contradict each other, what they lack in thin parts is found by colour: within the hull of the others,
-    what resembles the rest of the object in its picture is added. Pieces that are missing cost more than ones too many,
-    since a field is carved out of all masks.
+    If masks contradict each other, thin parts that they lack are found by colour: pixels in the silhouette of the hull
+    of the others that resemble the rest of the object in the image are added. This favours masks that are too large,
+    because a part that is missing in one mask is missing in the visual hull of all.
 
     Args:
-        masks: one a camera, opacity of the picture without its lens.
+        masks: one per camera, opacity of the undistorted image.
         model: its cameras.
-        sphere: that holds the object.
-        pictures: what the masks are of, without which nothing is found by colour.
+        sphere: that contains the object.
+        pictures: the undistorted images. Without them nothing is added by colour.
+
+    Returns:
+        The corrected masks and the hull. Fewer than eight masks are returned as they are.
     """
     small = [_reduced(mask) for mask in masks]
     pairs = [(each, _camera(model, row, masks[row], each.shape)) for row, each in enumerate(small)]
-    judged = _judged(pairs, sphere, COARSE)
-    votes = _votes(judged, pairs)
-    hull = judged.hull(votes)
+    grid = _voxel_votes(pairs, sphere, COARSE)
+    votes = _votes(grid, pairs)
+    hull = grid.hull(votes)
     ball = _ball(hull)
     if ball is not None:  # the same again, finer
-        judged = _judged(pairs, Sphere(ball.centre, min(ZOOM * ball.radius, sphere.radius)), FINE)
-        votes = _votes(judged, pairs)
-        hull = judged.hull(votes)
+        grid = _voxel_votes(pairs, Sphere(ball.centre, min(ZOOM * ball.radius, sphere.radius)), FINE)
+        votes = _votes(grid, pairs)
+        hull = grid.hull(votes)
     if not hull.occupied.any():
         return Agreement(list(masks), np.zeros(len(masks)), votes, None)
     if len(masks) < FEWEST:
@@ -109,7 +111,7 @@ def agree(
     surrounded = _is_surrounded(model, hull.bounds)
     mended, disagreement, outlines = [], [], []
     for row, (reduced, one) in enumerate(pairs):
-        others = judged.hull(votes, without=row)
+        others = grid.hull(votes, without=row)
         seen = silhouettes(others.centres(), others, one)[0].numpy()
         lost, extra = _differences(reduced, seen)
         lost &= surrounded[row]
@@ -123,6 +125,7 @@ def agree(
 
 
 def _reduced(mask: Mask) -> Bool[np.ndarray, "row column"]:
+    """A mask reduced to at most LONGEST pixels along its longer side."""
     height, width = mask.shape
     factor = min(1.0, LONGEST / max(height, width))
     size = max(1, round(width * factor)), max(1, round(height * factor))
@@ -130,21 +133,22 @@ def _reduced(mask: Mask) -> Bool[np.ndarray, "row column"]:
 
 
 def _camera(model: SparseModel, row: int, mask: Mask, size: tuple[int, ...]) -> PinholeCamera:
+    """The camera of a mask that was reduced to (height, width)."""
     calibration = torch.from_numpy(model.calibrations[row : row + 1]).float()
     pose = torch.from_numpy(model.camera_from_world[row : row + 1]).float()
     return camera.resized(camera.pinhole(calibration, pose, *mask.shape), size[0], size[1])
 
 
 @dataclass(frozen=True)
-class _Judged:
-    """What each mask says of the voxels of a grid: whether it rules them out, and which of them may be the object."""
+class _VoxelVotes:
+    """For the voxels of a grid, whether each mask rules them out, and whether enough images show them."""
 
     ruled: Bool[Tensor, "camera x y z"]
     candidate: Bool[Tensor, "x y z"]
     sphere: Sphere
 
     def hull(self, votes: int, without: int | None = None) -> Occupancy:
-        """The voxels that fewer than `votes` masks rule out, one of them left out where asked."""
+        """The visual hull: voxels that fewer than `votes` masks rule out; without the mask of one camera if given."""
         counts = self.counts if without is None else self.counts - self.ruled[without].int()
         return Occupancy(self.candidate & (counts < votes), self.sphere)
 
@@ -154,14 +158,15 @@ class _Judged:
         return self.ruled.sum(0, dtype=torch.int32)
 
 
-def _judged(pairs: Sequence[tuple[np.ndarray, PinholeCamera]], sphere: Sphere, side: int) -> _Judged:
+def _voxel_votes(pairs: Sequence[tuple[np.ndarray, PinholeCamera]], sphere: Sphere, side: int) -> _VoxelVotes:
+    """The votes of all masks on the voxels of a grid with `side` voxels per axis."""
     ruled = torch.stack([_ruled_out(mask, one, sphere, side) for mask, one in pairs])
-    # what the pictures show within their borders is an empty mask's to rule out; half as fine will do
+    # an image shows those voxels within its borders that an empty mask would rule out; half the resolution suffices
     shown = sum((_ruled_out(np.zeros_like(mask), one, sphere, side // 2).int() for mask, one in pairs), torch.zeros(()))
     candidate = shown >= max(2.0, SEEN * len(pairs))
     for axis in range(3):
         candidate = candidate.repeat_interleave(2, axis)
-    return _Judged(ruled, candidate, sphere)
+    return _VoxelVotes(ruled, candidate, sphere)
 
 
 def _ruled_out(mask: np.ndarray, one: PinholeCamera, sphere: Sphere, side: int) -> Bool[Tensor, "x y z"]:
@@ -169,15 +174,15 @@ def _ruled_out(mask: np.ndarray, one: PinholeCamera, sphere: Sphere, side: int) 
     return ~carve(torch.from_numpy(mask)[None, None], one, sphere, side).occupied
 
 
-def _votes(judged: _Judged, pairs: Sequence[tuple[np.ndarray, PinholeCamera]]) -> int:
-    """The number of votes with which hull and masks agree best; the least of those that are about as good."""
+def _votes(grid: _VoxelVotes, pairs: Sequence[tuple[np.ndarray, PinholeCamera]]) -> int:
+    """The least number of votes for which the agreement of hull and masks is within SETTLED of the best."""
     most = max(1, int(MOST_VOTES * len(pairs)))
     chosen = [pair for pair in pairs[:: max(1, len(pairs) // 16)] if pair[0].any()]
     if most == 1 or not chosen:
         return 1
     agreement = []
     for votes in range(1, most + 1):
-        hull = judged.hull(votes)
+        hull = grid.hull(votes)
         points = hull.centres()
         found = [(silhouettes(points, hull, one)[0].numpy(), mask) for mask, one in chosen]
         agreement.append(float(np.median([(seen & mask).sum() / (seen | mask).sum() for seen, mask in found])))
@@ -185,7 +190,7 @@ def _votes(judged: _Judged, pairs: Sequence[tuple[np.ndarray, PinholeCamera]]) -
 
 
 def _ball(hull: Occupancy) -> Sphere | None:
-    """The sphere around the voxels of a hull that lie within its bounds, None where there are none."""
+    """The sphere around the voxels of a hull that lie within its bounds, None if there are none."""
     points = hull.surface_centres
     points = points[hull.bounds.normalise(points).norm(dim=-1) <= 1]
     if not len(points):
@@ -195,13 +200,13 @@ def _ball(hull: Occupancy) -> Sphere | None:
 
 
 def _differences(mask: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a mask lacks of a silhouette, and what it has beside it, where a disc fits in."""
+    """The parts of a silhouette that a mask lacks, and those of the mask outside it, where a disc fits into them."""
     radius = max(2, round(DEEP * float(np.sqrt(seen.sum()))))
     rows, columns = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     disc = rows**2 + columns**2 <= radius**2
 
     def deep(difference: np.ndarray) -> np.ndarray:
-        padded = np.pad(difference, radius, mode="edge")  # the border of the picture is no border of the difference
+        padded = np.pad(difference, radius, mode="edge")  # so that the image border does not limit a difference
         opened = np.asarray(ndimage.binary_opening(padded, disc))[radius:-radius, radius:-radius]
         return ndimage.binary_dilation(opened, iterations=radius) & difference
 
@@ -209,7 +214,7 @@ def _differences(mask: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _mended(mask: Mask, lost: np.ndarray, extra: np.ndarray) -> Mask:
-    """A mask with what it lacked filled and what it had beside the object taken away, where there is any."""
+    """A mask with the lost parts filled and the extra parts removed."""
     if not (lost.any() or extra.any()):
         return mask
 
@@ -221,7 +226,7 @@ def _mended(mask: Mask, lost: np.ndarray, extra: np.ndarray) -> Mask:
 
 
 def _is_surrounded(model: SparseModel, sphere: Sphere) -> Bool[np.ndarray, " camera"]:
-    """Which cameras have others near them on opposite sides: the hull is not bounded by the outermost of an arc."""
+    """Which cameras have others near them on opposite sides; those at the ends of an arc of cameras do not."""
     ways = model.centres - np.array(sphere.centre)
     ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
     result = np.zeros(len(ways), bool)

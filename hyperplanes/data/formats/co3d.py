@@ -1,8 +1,9 @@
 """CO3D, version 2: frame_annotations.jgz beside the sequences of a category (Reizenstein et al., 2021).
 
-Poses are PyTorch3D's: x_camera = x_world R + T, x left, y up, z forward. Calibrations are in normalised coordinates:
-`ndc_isotropic` counts in halves of the shorter side, `ndc_norm_image_bounds` in halves of each side; the principal
-point is measured from the middle of the picture, to the left and up. Paths are relative to the folder of categories.
+Poses are PyTorch3D's: x_camera = x_world R + T, x left, y up, z forward. Calibrations are in normalised device
+coordinates. Their unit is half of the shorter side for `ndc_isotropic`, and half of each side for
+`ndc_norm_image_bounds`. The principal point is measured from the middle of the image, to the left and up. Paths are
+relative to the folder of categories.
 """
 
 from __future__ import annotations
@@ -28,21 +29,21 @@ __all__ = ["ANNOTATIONS", "catalogue", "is_sequence", "read_sequence"]
 ANNOTATIONS = "frame_annotations.jgz"
 SET_LISTS = "set_lists/set_lists_fewview_dev.json"
 LARGEST = 2**30
-"""Bytes of annotations, unpacked, above which they are refused."""
+"""Largest size of the annotations in bytes, decompressed."""
 
 _FLIP = np.diag([-1.0, -1.0, 1.0])  # x left, y up, z forward to x right, y down, z forward
 _REMEDY = "download the category again"
 
 
 def is_sequence(folder: Path) -> bool:
-    """Whether a folder holds one sequence, its category's annotations beside it."""
+    """Whether a folder holds one sequence and lies beside the annotations of its category."""
     return (folder / "images").is_dir() and (folder.resolve().parent / ANNOTATIONS).is_file()
 
 
 def read_sequence(folder: Path, root: Path) -> Listing:
-    """The posed pictures of one sequence, CATEGORY/SEQUENCE, in the order of their frames, with the published masks.
+    """The posed images of one sequence, CATEGORY/SEQUENCE, in the order of their frames, with the published masks.
 
-    Anything wrong with a file is a DataError.
+    It raises DataError if a file is missing or malformed.
     """
     whole = folder.resolve()
     category = whole.parent
@@ -51,15 +52,15 @@ def read_sequence(folder: Path, root: Path) -> Listing:
 
 
 def catalogue(folder: Path) -> Catalogue | None:
-    """The catalogue of a folder of categories, or of one; None where no annotations lie there.
+    """The catalogue of a folder of categories, or of one category; None if it has no annotations.
 
     Returns:
-        The sequences that have a folder: those of the frames to train on in set_lists_fewview_dev.json, those of the
-        frames to test on and those to validate with, all to test on without such a list; views alternate between
-        support and query.
+        The sequences that have a folder. A sequence is in the split of its frames in set_lists_fewview_dev.json: train,
+        test or val, whichever comes first; without this list or an entry in it, it is in the test split. Views
+        alternate between support and query.
 
     Raises:
-        DataError: files that are broken, a sequence in two categories, or no folder of any sequence.
+        DataError: a malformed file, a sequence in two categories, or no folder of any sequence.
     """
     homes = [folder] if (folder / ANNOTATIONS).is_file() else []
     homes = homes or sorted(path.parent for path in folder.glob(f"*/{ANNOTATIONS}"))
@@ -94,14 +95,14 @@ def catalogue(folder: Path) -> Catalogue | None:
 
 
 def _splits(path: Path) -> dict[str, str]:
-    """The split of each sequence, that of its frames to train on first; empty without a list."""
+    """The split of each sequence, the first of train, test and val that lists a frame of it; empty without lists."""
     if not path.is_file():
         return {}
     document, result = read_json(path), {}
     for split in ("val", "test", "train"):
         for entry in document.get(split) or ():
             if not (isinstance(entry, list) and entry and isinstance(entry[0], str)):
-                raise DataError(path, f"(sequence, frame, picture) in {split}", repr(entry)[:60], _REMEDY)
+                raise DataError(path, f"(sequence, frame, image) in {split}", repr(entry)[:60], _REMEDY)
             result[entry[0]] = split
     return result
 
@@ -128,7 +129,7 @@ def _annotations(path: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def _listing(folder: Path, listed: list[dict[str, Any]], root: Path) -> Listing:
-    """The pictures of a sequence; paths are relative to the folder of categories."""
+    """The images of a sequence, from its annotations. Their paths are relative to the folder of categories."""
     source, base = folder.parent / ANNOTATIONS, folder.parent.parent
     if not listed:
         raise DataError(source, f"frames of {folder.name}", "none", _REMEDY)
@@ -159,7 +160,7 @@ def _listing(folder: Path, listed: list[dict[str, Any]], root: Path) -> Listing:
 
 
 def _calibration(view: dict[str, Any], source: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """The calibration of a picture of (height, width)."""
+    """The calibration of an image of (height, width)."""
     half = np.array([size[1], size[0]]) / 2
     kind = view.get("intrinsics_format", "ndc_norm_image_bounds")
     if kind not in ("ndc_norm_image_bounds", "ndc_isotropic"):

@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, text or binary, to posed pictures; distorted pictures are undistorted."""
+"""Read posed images from COLMAP's sparse models, text or binary."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hyperplanes.utilities.files import DataError, check_link, inside, malformed
 
 __all__ = ["find_model", "image_names", "read_colmap"]
 
-# COLMAP's number, name and parameters of the camera models that are read
+# COLMAP's number, name and parameters of the supported camera models
 _MODELS = {
     0: ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
     1: ("PINHOLE", ("fx", "fy", "cx", "cy")),
@@ -49,10 +49,11 @@ class _Image:
 
 
 def find_model(folder: str | Path) -> Path | None:
-    """The folder with cameras and images files, where COLMAP and the tools around it put it; None where there is none.
+    """The folder with the files cameras and images of a sparse model; None if there is none.
 
-    That is the folder itself, or sparse/0 of it (sparse/1, ...), sparse, dense/sparse, dense, distorted/sparse/0 and
-    colmap/sparse/0. Of the parts of a reconstruction that fell into several, the one with most pictures.
+    It is searched where COLMAP and tools that call it write it: in the folder itself, sparse, dense/sparse, dense,
+    distorted/sparse, colmap/sparse and colmap, or in their numbered subfolders such as sparse/0. If a reconstruction
+    has several models, the one with the largest file of images is taken.
 
     >>> find_model("no such folder") is None
     True
@@ -70,23 +71,23 @@ def find_model(folder: str | Path) -> Path | None:
 
 
 def read_colmap(folder: Path, root: Path) -> Listing:
-    """The posed pictures of a COLMAP reconstruction.
+    """The posed images of a COLMAP reconstruction.
 
-    COLMAP's world and its OpenCV axes are kept; its principal point counts from the pictures' borders. Pictures lie in
-    images/ or input/ beside the model or above it; those of its cameras' size are taken before others, then the
-    nearest. Cameras with distortion (SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV) keep their calibration, their pictures
-    are resampled. Masks may lie in masks/ beside the pictures' folder.
+    The world is COLMAP's, which has OpenCV axes. COLMAP's principal points are at half-pixel centres. The images lie in
+    images/ or input/ beside the model or above it; a folder whose images have the size of the cameras is preferred,
+    then the nearest one. Cameras with distortion (SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV) keep their calibration,
+    and their images are undistorted. Masks may lie in masks/ beside the folder of images.
 
     Args:
         folder: the project, or the model itself.
-        root: the model may not lie outside of it, symbolic links followed, nor a picture outside of it and of the
-            folder of pictures.
+        root: the model may not lie outside it, symbolic links followed. An image may lie neither outside it nor outside
+            the folder of images.
 
     Returns:
-        The pictures, sorted by name.
+        The images, sorted by name.
 
     Raises:
-        DataError: no model, a camera model that is not read (fisheye), a truncated file, or pictures that are missing.
+        DataError: no model, an unsupported camera model such as a fisheye, a truncated file, or missing images.
     """
     model = find_model(folder)
     if model is None:
@@ -118,17 +119,17 @@ def read_colmap(folder: Path, root: Path) -> Listing:
 
 
 def image_names(model: Path, root: Path) -> dict[int, str]:
-    """The names of a model's registered images by their numbers; what is broken is a DataError.
+    """The names of a model's registered images by their numbers; raises DataError if a file is malformed.
 
     Args:
-        model: the folder that `find_model` found.
-        root: no file may lie outside of it, symbolic links followed.
+        model: the folder that `find_model` returned.
+        root: no file may lie outside it, symbolic links followed.
     """
     return {image.number: image.name for image in _read(model, root)[2]}
 
 
 def _read(model: Path, root: Path) -> tuple[tuple[Path, Path], dict[int, _Camera], list[_Image]]:
-    """The files of a model, and what they hold."""
+    """The files of cameras and images of a model, and their content."""
     binary = (model / "images.bin").is_file() and (model / "cameras.bin").is_file()
     suffix = ".bin" if binary else ".txt"
     paths = model / f"cameras{suffix}", model / f"images{suffix}"
@@ -141,7 +142,7 @@ def _read(model: Path, root: Path) -> tuple[tuple[Path, Path], dict[int, _Camera
 
 
 def _picture(home: Path, name: str, source: Path, root: Path) -> Path:
-    """Where a picture lies: inside its folder, or, through a link, elsewhere inside the root."""
+    """The path of an image, which lies in its folder or, through a symbolic link, elsewhere in the root."""
     if ".." not in Path(name).parts and home.resolve().is_relative_to(root.resolve()):
         return inside(root.resolve(), str(home.resolve().relative_to(root.resolve()) / name), source)
     return inside(home, name, source)
@@ -154,17 +155,17 @@ def _is_model(folder: Path) -> bool:
 
 
 def _count(model: Path) -> int:
-    """How large a part of a reconstruction is: the bytes of its file of images."""
+    """The size of a model: the bytes of its file of images."""
     return max((model / name).stat().st_size for name in ("images.bin", "images.txt") if (model / name).is_file())
 
 
 def _pictures_folder(
     folder: Path, model: Path, images: list[_Image], cameras: dict[int, _Camera], source: Path, root: Path
 ) -> Path:
-    """The folder that holds most of the pictures: images or input, beside the model or up to four folders above.
+    """The folder with most of the images: images or input, beside the model or up to four folders above it.
 
-    Of several, the one whose pictures have the size of their cameras, then the nearest: a model of undistorted pictures
-    lies beside these and below the originals.
+    If several have as many, the one with most images of their camera's size is taken, then the nearest: a model of
+    undistorted images lies beside these and below the original ones.
     """
     roots = [model, *list(model.absolute().parents)[:4]]
     homes = [root / name for root in roots for name in ("images", "input")] + [folder, model]
@@ -179,6 +180,7 @@ def _pictures_folder(
 
 
 def _camera(model: str, width: int, height: int, values: list[float], path: Path) -> _Camera:
+    """A camera from the name of its model and its parameters, with the principal point at integer pixel centres."""
     if model not in _PARAMETERS:
         known = ", ".join(_PARAMETERS)
         raise DataError(path, f"one of the camera models {known}", model, "run COLMAP's image_undistorter")
@@ -198,6 +200,7 @@ def _pose(quaternion: npt.NDArray[np.float64], translation: npt.NDArray[np.float
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
+    """The words of each line that is not a comment; an empty line has none."""
     for line in read_text(path).splitlines():
         if not line.startswith("#"):
             yield line.split()

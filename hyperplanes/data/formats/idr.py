@@ -27,17 +27,18 @@ def camera_file(folder: Path) -> Path | None:
 
 
 def read_idr(folder: Path, root: Path) -> Listing:
-    """The posed pictures of a scene in IDR's layout, with cameras.npz or cameras_sphere.npz.
+    """The posed images of a scene in IDR's layout, with cameras.npz or cameras_sphere.npz.
 
-    `world_mat_i` projects homogeneous points of the world to pixels (integer pixel centres), `scale_mat_i` takes the
-    unit sphere, in which the object lies, to that world. Cameras are brought into the world of the unit sphere. Picture
-    i is the i-th of image/ by name; mask/ holds masks of the same names, or numbered in the same order, as published.
+    `world_mat_i` projects homogeneous points of the world to pixels (integer pixel centres). `scale_mat_i` maps the
+    unit sphere, in which the object lies, to that world. The cameras are returned in the world of the unit sphere.
+    Image i is the i-th of image/ by name. mask/ holds masks of the same names, or numbered in the same order, as
+    published.
 
     Returns:
-        The pictures in the order of their names.
+        The images in the order of their names.
 
     Raises:
-        DataError: no such file, matrices that are missing or project nothing, or not one picture a matrix.
+        DataError: no such file, matrices that are missing or singular, or not one image per matrix.
     """
     source = camera_file(folder)
     if source is None:
@@ -50,7 +51,7 @@ def read_idr(folder: Path, root: Path) -> Listing:
     if not pictures or count != len(pictures):
         more = " or more" if count > len(pictures) else ""
         raise DataError(
-            source, f"{count}{more} pictures, one a world_mat", f"{len(pictures)} in {home}", "copy all pictures"
+            source, f"{count}{more} images, one per world_mat", f"{len(pictures)} in {home}", "copy all images"
         )
     masks = find_masks([folder / "mask", folder / "masks"], pictures, root)
     frames = []
@@ -65,7 +66,7 @@ def read_idr(folder: Path, root: Path) -> Listing:
 def _decomposed(
     arrays: dict[str, npt.NDArray[np.float64]], index: int, source: Path
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Calibration and camera_from_world, OpenCV axes, of P = K [R | t]."""
+    """The calibration and camera_from_world, OpenCV axes, of a projection P = K [R | t]."""
     from scipy.linalg import rq
 
     parts = []

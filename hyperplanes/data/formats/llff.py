@@ -29,18 +29,19 @@ def is_llff(folder: Path) -> bool:
 
 
 def read_llff(folder: Path, root: Path) -> Listing:
-    """The posed pictures of a scene in LLFF's layout.
+    """The posed images of a scene in LLFF's layout.
 
-    A row of poses_bounds.npy is a 3 x 5 matrix, row by row, and two depths: the axes of the camera in the world (down,
-    right, backwards), its centre, and (height, width, focal length); the nearest and the farthest depth that it shows.
-    The principal point is the middle of the picture. Rows are in the order of the sorted names of the pictures, which
-    lie in images/, or scaled down by N in images_N/, of which the largest are read; masks may lie in masks/ or mask/.
+    A row of poses_bounds.npy is a 3 x 5 matrix in row-major order and two depths. The columns of the matrix are the
+    axes of the camera in the world (down, right, backwards), its centre, and (height, width, focal length). The depths
+    are the nearest and the farthest that the image shows. The principal point is the middle of the image. Rows are in
+    the order of the sorted names of the images. These lie in images/, or reduced by a factor N in images_N/; the
+    largest are read. Masks may lie in masks/ or mask/.
 
     Returns:
-        The pictures in the order of their names.
+        The images in the order of their names.
 
     Raises:
-        DataError: another array, or not one picture a row.
+        DataError: an array of another shape or with invalid numbers, or not one image per row.
     """
     source = folder / FILE
     rows = _rows(source, root)
@@ -53,7 +54,6 @@ def read_llff(folder: Path, root: Path) -> Listing:
         if not (np.isfinite(matrix).all() and min(height, width, focal) > 0):
             found = f"{height:g}, {width:g}, {focal:g} for {path.name}"
             raise DataError(source, "a positive height, width and focal length in each row", found, "write it again")
-        # columns: down, right, backwards, the centre
         down, right, backwards, centre = matrix[:, :4].T
         world_from_camera = check_pose(np.stack([right, down, -backwards, centre], 1), source, path.name)
         near, far = row[15:]
@@ -72,6 +72,7 @@ def read_llff(folder: Path, root: Path) -> Listing:
 
 
 def _rows(source: Path, root: Path) -> npt.NDArray[np.float64]:
+    """The (view, 17) array of the file."""
     rows = read_array(source, "an array of numbers", LARGEST_FILE, root)
     if (
         not isinstance(rows, np.ndarray)
@@ -85,7 +86,7 @@ def _rows(source: Path, root: Path) -> npt.NDArray[np.float64]:
 
 
 def _pictures(folder: Path, count: int, root: Path) -> list[Path]:
-    """The largest pictures of which there is one a row, by name."""
+    """The largest images of which there is one per row, sorted by name."""
     scaled = [path for path in folder.iterdir() if path.is_dir() and re.fullmatch(r"images(_\d+)?", path.name)]
     homes = sorted(scaled, key=lambda path: int(path.name.partition("_")[2] or 1))
     found = {}
@@ -95,4 +96,4 @@ def _pictures(folder: Path, count: int, root: Path) -> list[Path]:
             return files
         found[home.name] = len(files)
     text = ", ".join(f"{number} in {name}" for name, number in found.items()) or "no folder images"
-    raise DataError(folder / FILE, f"{count} pictures, one a row", text, "copy all pictures to images/")
+    raise DataError(folder / FILE, f"{count} images, one per row", text, "copy all images to images/")

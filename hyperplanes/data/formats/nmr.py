@@ -1,7 +1,8 @@
 """NMR's renderings of ShapeNet, 24 views an object, as DVR published them (Niemeyer et al., 2020; pixelNeRF).
 
-CLASS/softras_train.lst (_val, _test) list objects; CLASS/OBJECT/ holds image/0000.png, perhaps mask/0000.png, and
-cameras.npz: world_mat_i is camera_from_world in OpenCV axes, camera_mat_i projects to [-1, 1] across the picture.
+CLASS/softras_train.lst, softras_val.lst and softras_test.lst list the objects. CLASS/OBJECT/ holds image/0000.png,
+optionally mask/0000.png, and cameras.npz. In it, world_mat_i is camera_from_world with OpenCV axes, and camera_mat_i
+projects to [-1, 1] along each axis of the image.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from hyperplanes.utilities.files import DataError, list_files, read_text
 __all__ = ["catalogue", "is_nmr", "read_nmr"]
 
 LISTS = "softras_{split}.lst"
-RIGID = 1e-2  # by which R R^T may differ from the identity; IDR's world_mat holds focal lengths of hundreds of pixels
+RIGID = 1e-2  # largest difference of R R^T from the identity; IDR's world_mat contains the focal length in pixels
 
 
 def is_nmr(folder: Path) -> bool:
-    """Whether a folder holds one object of NMR's renderings: IDR's files, but poses and calibrations apart."""
+    """Whether a folder holds one object of NMR's renderings: IDR's files, but with separate poses and calibrations."""
     path = folder / "cameras.npz"
     if not (path.is_file() and (folder / "image").is_dir() and zipfile.is_zipfile(path)):
         return False
@@ -44,18 +45,18 @@ def is_nmr(folder: Path) -> bool:
 
 
 def read_nmr(folder: Path, root: Path) -> Listing:
-    """The posed pictures of one object; the world is ShapeNet's, y up.
+    """The posed images of one object; the world is ShapeNet's, y up.
 
     Returns:
-        The pictures in the order of their names; the principal point is the middle of each.
+        The images in the order of their names, with principal points in their middle.
 
     Raises:
-        DataError: no picture, or cameras that are missing or none.
+        DataError: no image, or cameras that are missing or invalid.
     """
     source = folder / "cameras.npz"
     pictures = list_files(folder / "image", PICTURE_SUFFIXES, root)
     if not pictures:
-        raise DataError(folder / "image", "pictures", "none", "download the object again")
+        raise DataError(folder / "image", "images", "none", "download the object again")
     wanted = {f"{kind}_{index}" for kind in ("world_mat", "camera_mat") for index in range(len(pictures))}
     arrays = read_arrays(source, wanted, root)
     masks = find_masks([folder / "mask"], pictures, root)
@@ -63,20 +64,20 @@ def read_nmr(folder: Path, root: Path) -> Listing:
     for index, (path, mask) in enumerate(zip(pictures, masks, strict=True)):
         pose = check_pose(_matrix(arrays, f"world_mat_{index}", source), source, path.name)
         x, y = np.abs(np.diagonal(_matrix(arrays, f"camera_mat_{index}", source))[:2]).astype(np.float64)
-        matrix = np.array([[x, 0.0, 0.5], [0.0, y, 0.5], [0.0, 0.0, 1.0]])  # of a picture of 2 x 2 pixels
+        matrix = np.array([[x, 0.0, 0.5], [0.0, y, 0.5], [0.0, 0.0, 1.0]])  # for an image of 2 x 2 pixels
         frames.append(Frame(path, f"image/{path.name}", pose, partial(scaled_matrix, matrix, (2, 2)), mask=mask))
     return Listing(frames, source)
 
 
 def catalogue(folder: Path) -> Catalogue | None:
-    """The catalogue of a folder of classes, or of one class; None where no list of objects lies there.
+    """The catalogue of a folder of classes, or of one class; None if it has no list of objects.
 
     Returns:
-        The splits of the lists, views alternating between support and query. Objects whose folder is missing are
-        skipped and counted.
+        The catalogue with the splits of the lists. Views alternate between support and query. Objects without a folder
+        are skipped and counted.
 
     Raises:
-        DataError: names in a list that are no plain ones, or no folder of any of them.
+        DataError: a list with names that are not plain file names, or no folder of any object.
     """
     homes = [folder] if _lists(folder) else [child for child in sorted(folder.iterdir()) if _lists(child)]
     if not homes:
@@ -111,6 +112,7 @@ def _lists(folder: Path) -> dict[str, Path]:
 
 
 def _matrix(arrays: dict[str, npt.NDArray[np.float64]], name: str, source: Path) -> npt.NDArray[np.float64]:
+    """The matrix of that name, checked to be one."""
     value = arrays.get(name)
     if value is None or value.ndim != 2 or min(value.shape) < 2 or not np.issubdtype(value.dtype, np.number):
         found = "nothing" if value is None else f"{value.dtype} {value.shape}"

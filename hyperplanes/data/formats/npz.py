@@ -1,4 +1,7 @@
-"""The two layouts of the paper's data: learnit's folders (128 pixels) and the authors' .npz files (200 pixels)."""
+"""The two layouts of the paper's data: learnit's folders (128 pixels) and the authors' .npz files (200 pixels).
+
+The arrays of other layouts in .npz and .npy files are read by `read_arrays` and `read_array`, too.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +26,10 @@ from hyperplanes.utilities.files import MALFORMED, DataError, check_regular, mal
 __all__ = ["AUTHORS_FOCAL", "LEGACY", "catalogue", "read_array", "read_arrays", "read_npz"]
 
 AUTHORS_FOCAL = 277.77
-"""Focal length in pixels of the authors' 200x200 pictures: Blender's 50 mm on 36 mm."""
+"""Focal length in pixels of the authors' 200x200 images: Blender's 50 mm on a sensor width of 36 mm."""
 
 LEGACY = ("learnit-128", "hyperplanes-200")
-"""The layouts whose published code puts principal points at W / 2 at integer pixel centres."""
+"""The layouts whose published code places principal points at W / 2 at integer pixel centres."""
 
 LARGEST_ARRAY = 2 * 2**30
 
@@ -34,24 +37,25 @@ LARGEST_ARRAY = 2 * 2**30
 def read_npz(
     path: str | Path, *, legacy: bool = False, bounds: Sphere | None = None, root: Path | None = None
 ) -> Posed:
-    """The posed pictures of one object of the 200x200 data (HyperPlanes, MultiPlaneNeRF, points2nerf).
+    """The posed images of one object of the 200x200 data (HyperPlanes, MultiPlaneNeRF, points2nerf).
 
-    `images` (view, height, width, 3 or 4), 8 bits or floats in [0, 1]; `cam_poses` or `poses` (view, 4, 4), OpenGL
-    camera-to-world. Three channels lie over white and have no masks. `focal` in pixels, where present, replaces
-    277.77 per 200 pixels of width; `rgba` 8-bit with straight alpha, where present, replaces `images`.
+    The file holds `images` (view, height, width, 3 or 4), 8 bits or floats in [0, 1], and `cam_poses` or `poses` (view,
+    4, 4), camera-to-world with OpenGL axes. Images of three channels are over white and have no masks. `rgba`, 8 bits
+    with straight alpha, replaces `images` if it is present. The focal length is `focal` in pixels if it is present,
+    otherwise 277.77 per 200 pixels of width.
 
     Args:
-        path: the .npz file; pickles in it are refused.
-        legacy: put the principal point at W / 2 at integer pixel centres, as the authors' code does, instead of at
-            the middle of the picture, (W - 1) / 2.
-        bounds: of the scene; estimated when None.
+        path: the .npz file, which may not contain pickles.
+        legacy: place the principal point at W / 2 at integer pixel centres, as the authors' code does, instead of at
+            the middle of the image, (W - 1) / 2.
+        bounds: of the scene; if None, they are estimated.
         root: as in `read_arrays`.
 
     Returns:
-        The pictures in the order of the file.
+        The images in the order of the file.
 
     Raises:
-        DataError: not such a file, too large, or with other content.
+        DataError: no such file, a file that is too large, or other content.
     """
     path = Path(path)
     arrays = read_arrays(path, {"images", "rgba", "cam_poses", "poses", "focal"}, root)
@@ -83,18 +87,18 @@ def read_npz(
 
 
 def read_arrays(path: str | Path, names: set[str], root: Path | None = None) -> dict[str, npt.NDArray[Any]]:
-    """Some arrays of an .npz file; sizes are looked at before anything is unpacked, pickles are refused.
+    """Some arrays of an .npz file. Their sizes are checked before they are decompressed.
 
     Args:
         path: the file.
-        names: which arrays to read, those that there are.
+        names: the arrays to read; those that the file lacks are left out.
         root: as in `files.check_regular`.
 
     Returns:
         The arrays by name.
 
     Raises:
-        DataError: no such file, not an .npz file, a pickle in it, or too large.
+        DataError: no such file, not an .npz file, a pickle in it, or arrays of more than LARGEST_ARRAY bytes.
     """
     path = Path(path)
     try:
@@ -115,13 +119,13 @@ def read_arrays(path: str | Path, names: set[str], root: Path | None = None) -> 
 
 
 def read_array(path: Path, expected: str, largest: int, root: Path) -> npt.NDArray[Any]:
-    """The content of an .npy file of at most `largest` bytes; what is broken, or a pickle, is a DataError."""
+    """The array in an .npy file of at most `largest` bytes; raises DataError for a malformed file or a pickle."""
     with malformed(path, expected):
         return np.load(io.BytesIO(read_bytes(path, largest, root)), allow_pickle=False)
 
 
 def _claimed_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
-    """The bytes that an array's own header says it has, whatever the archive says."""
+    """The size in bytes that an array's own header states; the size that the archive states may be another."""
     with archive.open(entry) as member:
         version = np.lib.format.read_magic(member)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -134,19 +138,20 @@ def _claimed_size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> int:
 def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -> Catalogue | None:
     """The catalogue of a folder in one of the two layouts.
 
-    learnit: CLASS_splits.json beside the folder of the class; CLASSs/NAME/transforms.json with its pictures beside it.
-    The authors': CLASS/sampled/VIEWS_NAME.npz, sorted by name, the first 80 % to train on and the last 20 % to test,
-    unless a manifest says otherwise. In both, objects that are listed and missing are skipped and counted; the first
-    half of the views is support and the rest query, as learnit's notebook and the authors' code take 25 and 25 of 50;
-    in data sets with a manifest, which `generate` wrote, views alternate.
+    learnit's layout has CLASS_splits.json beside the folder of the class, and CLASSs/NAME/transforms.json with its
+    images beside it. The authors' layout has CLASS/sampled/VIEWS_NAME.npz. Sorted by name, the first 80 % are the
+    training split and the last 20 % the test split, unless a manifest states the splits. Objects that are listed but
+    missing are skipped and counted. The first half of the views is the support and the rest the query, since learnit's
+    notebook and the authors' code take 25 and 25 of 50. In data sets with a manifest, which `generate` wrote, views
+    alternate between support and query.
 
     Args:
-        folder: what may be in one of the layouts.
+        folder: which may be in one of the two layouts.
         manifest: of the folder, empty without one.
         legacy: as in `read_npz`.
 
     Returns:
-        The catalogue; None when it is something else.
+        The catalogue; None for another layout.
     """
     bounds = stated_bounds(manifest, folder / "manifest.json")
     archives = sorted(folder.glob("*/sampled/*.npz")) or sorted(folder.glob("sampled/*.npz"))
@@ -159,12 +164,13 @@ def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -
 def _authors(
     folder: Path, archives: list[Path], manifest: dict[str, Any], bounds: Sphere | None, legacy: bool
 ) -> Catalogue:
+    """The catalogue of a folder in the authors' layout."""
     paths: dict[str, Path] = {}
     for path in archives:
         other = paths.setdefault(path.stem.rpartition("_")[2], path)
         if other != path:
             raise DataError(path, "a name that no other object has", f"that of {other}", "rename one of them")
-    if isinstance(manifest.get("objects"), dict):  # whose names have underscores
+    if isinstance(manifest.get("objects"), dict):  # their names may have underscores, those in file names have hyphens
         manifest = {**manifest, "objects": {k.replace("_", "-"): v for k, v in manifest["objects"].items()}}
     skipped: list[str] = []
     splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
@@ -194,6 +200,7 @@ def _authors(
 def _learnit(
     folder: Path, files: list[Path], manifest: dict[str, Any], bounds: Sphere | None, legacy: bool
 ) -> Catalogue:
+    """The catalogue of a folder in learnit's layout."""
     homes: dict[str, Path] = {}
     skipped: list[str] = []
     splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
@@ -223,7 +230,7 @@ def _learnit(
 
 
 def _home(folder: Path, name: str, file: Path) -> Path | None:
-    """The folder of an object, None where there is none."""
+    """The folder of an object, None if there is none."""
     singular = file.name.removesuffix("_splits.json")
     candidates = [folder / f"{singular}s" / name, folder / singular / name, folder / name]
     candidates += [child / name for child in sorted(folder.iterdir()) if child.is_dir()]
@@ -231,6 +238,7 @@ def _home(folder: Path, name: str, file: Path) -> Path | None:
 
 
 def _rgba(images: npt.NDArray[Any], path: Path) -> tuple[npt.NDArray[np.uint8], bool]:
+    """The images as RGBA with 8 bits, and whether they have an alpha channel."""
     if images.dtype != np.uint8:
         if not np.issubdtype(images.dtype, np.floating) or not np.isfinite(images).all():
             raise DataError(path, "images of 8 bits or finite floats", f"{images.dtype}", "check the file")

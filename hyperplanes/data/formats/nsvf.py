@@ -1,4 +1,4 @@
-"""NSVF's layout: intrinsics.txt, bbox.txt, pose/ and rgb/ with the split in the names (Liu et al., 2020)."""
+"""NSVF's layout: intrinsics.txt, bbox.txt, pose/ and rgb/, with the split in the file names (Liu et al., 2020)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _REMEDY = "download the scene again"
 
 
 def is_nsvf(folder: Path) -> bool:
-    """Whether a folder holds one scene in NSVF's layout: SRN's folders, and names that begin with the split."""
+    """Whether a folder holds one scene in NSVF's layout: SRN's folders, with file names that begin with the split."""
     if not ((folder / "intrinsics.txt").is_file() and (folder / "rgb").is_dir() and (folder / "pose").is_dir()):
         return False
     names = [path.name for path in (folder / "rgb").iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
@@ -31,21 +31,21 @@ def is_nsvf(folder: Path) -> bool:
 
 
 def read_nsvf(folder: Path, root: Path) -> Listing:
-    """The posed pictures of a scene in NSVF's layout.
+    """The posed images of a scene in NSVF's layout.
 
-    pose/*.txt are OpenCV camera-to-world; intrinsics.txt is a 3 x 3 or 4 x 4 calibration, or begins with
-    "f cx cy"; its principal point counts from the pictures' borders. bbox.txt, where it is, holds the corners of a box
+    pose/*.txt are camera-to-world poses with OpenCV axes. intrinsics.txt is a 3 x 3 or 4 x 4 calibration, or begins
+    with "f cx cy"; its principal point is at half-pixel centres. bbox.txt, if it exists, holds the corners of a box
     around the scene.
 
     Returns:
-        The pictures, sorted by name: those to train on, to validate with, and to test on.
+        The images, sorted by name: those of the training, validation and test splits.
 
     Raises:
-        DataError: anything wrong with a file.
+        DataError: a file is missing or malformed.
     """
     pictures = list_files(folder / "rgb", PICTURE_SUFFIXES, root)
     if not pictures:
-        raise DataError(folder / "rgb", "pictures", "none", _REMEDY)
+        raise DataError(folder / "rgb", "images", "none", _REMEDY)
     matrix, size = _intrinsics(folder / "intrinsics.txt", root)
     calibrate = (lambda _: matrix) if size is None else partial(scaled_matrix, matrix, size)
     frames = []
@@ -57,9 +57,9 @@ def read_nsvf(folder: Path, root: Path) -> Listing:
 
 
 def read_nsvf_task(folder: Path, name: str, downscale: int | None, root: Path) -> PosedTask:
-    """Support and query of a scene: the pictures 0_* to train on and 2_* to test on, or 1_* where there are none.
+    """Support and query of a scene: the training images 0_*, and the test images 2_* or, without these, 1_*.
 
-    Views alternate where the names leave one of the two halves empty.
+    Views alternate between support and query if one of the two would be empty.
     """
     scene = assemble(read_nsvf(folder, root), downscale)[0]
     splits = [[at for at, each in enumerate(scene.names) if Path(each).name[0] == digit] for digit in "012"]
@@ -70,7 +70,7 @@ def read_nsvf_task(folder: Path, name: str, downscale: int | None, root: Path) -
 
 
 def _intrinsics(path: Path, root: Path) -> tuple[npt.NDArray[np.float64], tuple[int, int] | None]:
-    """The calibration, integer pixel centres, and (height, width) where the file states it."""
+    """The calibration, integer pixel centres, and (height, width) if the file states it, otherwise None."""
     lines = read_rows(path, "a calibration in numbers", root)
     size = None
     values = np.array([value for line in lines for value in line])
@@ -93,7 +93,7 @@ def _intrinsics(path: Path, root: Path) -> tuple[npt.NDArray[np.float64], tuple[
 
 
 def _box(path: Path, root: Path) -> Sphere | None:
-    """The sphere around the box, None where there is no file."""
+    """The sphere around the box, None if there is no file."""
     if not path.exists():
         return None
     values = read_numbers(path, [6, 7], root)  # the seventh is the side of a voxel

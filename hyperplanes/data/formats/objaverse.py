@@ -1,9 +1,11 @@
-"""Folders of many objects rendered by Blender: Objaverse's views as Zero-1-to-3 publishes them, and OmniObject3D.
+"""Data sets of objects rendered by Blender: Objaverse as Zero-1-to-3 publishes it, and OmniObject3D.
 
-Zero-1-to-3 (Liu et al., 2023): OBJECT/000.png, transparent, beside OBJECT/000.npy, camera_from_world (3, 4) in
-Blender's axes; a lens of 35 mm on 32 mm; objects fill a unit cube; valid_paths.json lists objects, of which the last
-hundredth is kept to test on. OmniObject3D (Wu et al., 2023): CATEGORY/OBJECT/render/transforms.json beside images/; the
-first three objects of a category are kept to test on, as in the authors' benchmarks.
+Zero-1-to-3 (Liu et al., 2023): OBJECT/000.png with alpha beside OBJECT/000.npy, which holds camera_from_world (3, 4) in
+Blender's axes. The focal length is 35 mm on a sensor width of 32 mm, and objects fill a unit cube. valid_paths.json
+lists the objects; the last hundredth of the list is the test split.
+
+OmniObject3D (Wu et al., 2023): CATEGORY/OBJECT/render/transforms.json beside images/. The first three objects of a
+category are the test split, as in the authors' benchmarks.
 """
 
 from __future__ import annotations
@@ -27,9 +29,9 @@ from hyperplanes.utilities.files import DataError, list_files, malformed, read_t
 
 __all__ = ["is_omniobject", "is_rendered", "objaverse", "omniobject", "read_omniobject", "read_rendered"]
 
-FOCAL = 35 / 32  # of the width
-CUBE = Sphere((0.0, 0.0, 0.0), math.sqrt(3) / 2)
-HELD_OUT = 3  # objects of a category of OmniObject3D
+FOCAL = 35 / 32  # in image widths
+CUBE = Sphere((0.0, 0.0, 0.0), math.sqrt(3) / 2)  # around the unit cube
+HELD_OUT = 3  # test objects in a category of OmniObject3D
 VALID = "valid_paths.json"
 _LARGEST_ARRAY = 4096
 _REMEDY = "download the object again"
@@ -41,13 +43,13 @@ def is_rendered(folder: Path) -> bool:
 
 
 def read_rendered(folder: Path, root: Path) -> Listing:
-    """The posed pictures of one object of Objaverse; the world is Blender's, z up.
+    """The posed images of one object of Objaverse; the world is Blender's, z up.
 
     Returns:
-        The pictures in the order of their numbers.
+        The images in the order of their numbers.
 
     Raises:
-        DataError: a picture without its camera, or one that is none.
+        DataError: an image without its camera, or a malformed file.
     """
     frames = []
     for path in list_files(folder, {".png"}, root):
@@ -60,13 +62,13 @@ def read_rendered(folder: Path, root: Path) -> Listing:
 
 
 def objaverse(folder: Path) -> Catalogue | None:
-    """The catalogue of a folder of such objects, and perhaps valid_paths.json; None where it is something else.
+    """The catalogue of a folder of objects, with or without valid_paths.json; None if it is in another layout.
 
     Returns:
-        The objects, all of them to test on where no list says otherwise; views alternate between support and query.
+        The objects, all in the test split without valid_paths.json. Views alternate between support and query.
 
     Raises:
-        DataError: a list that is none of plain names.
+        DataError: valid_paths.json is not a list of plain names.
     """
     names = [child.name for child in sorted(folder.iterdir()) if child.is_dir() and is_rendered(child)]
     if not names:
@@ -96,10 +98,10 @@ def is_omniobject(folder: Path) -> bool:
 
 
 def read_omniobject(folder: Path, downscale: int | None, root: Path) -> Posed:
-    """The posed pictures of one object of OmniObject3D, CATEGORY/OBJECT; the world is Blender's, z up.
+    """The posed images of one object of OmniObject3D, CATEGORY/OBJECT; the world is Blender's, z up.
 
-    Their background is black and there is no alpha: where every pixel of the border is black, what is not black is the
-    object. Anything wrong with a file is a DataError.
+    The published images have a black background and no alpha. If every border pixel is black, the masks are the pixels
+    that are not black. It raises DataError if a file is missing or malformed.
     """
     found = assemble(read_transforms(folder / "render" / "transforms.json", root=root), downscale)[0]
     found = replace(found, names=tuple(f"render/{name}" for name in found.names))
@@ -112,10 +114,11 @@ def read_omniobject(folder: Path, downscale: int | None, root: Path) -> Posed:
 
 
 def omniobject(folder: Path) -> Catalogue | None:
-    """The catalogue of blender_renders/, of what holds it, or of one category; None where it is something else.
+    """The catalogue of blender_renders/, of the folder above it, or of one category; None for another layout.
 
     Returns:
-        The objects, of each category the first three to test on; views alternate between support and query.
+        The objects: the first three of each category in the test split, the others in the train split. Views alternate
+        between support and query.
     """
     top = folder / "blender_renders" if (folder / "blender_renders").is_dir() else folder
     homes = {child.name: child for child in sorted(top.iterdir()) if child.is_dir() and is_omniobject(child)}

@@ -1,4 +1,4 @@
-"""Which layout lies at a path."""
+"""Find the layout of a path, and read it."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ class Layout:
     """A layout of one posed scene.
 
     Attributes:
-        found: what is true of a folder in it.
-        read: all of its pictures; a folder, a factor to scale down by, and the root that no file may lie outside of,
-            symbolic links followed.
-        read_task: support and query, where the layout has splits of its own; otherwise views alternate.
+        found: called with a folder; its result is true if the folder is in this layout.
+        read: returns all images; called with a folder, the factor to scale down by, and the root that no file may lie
+            outside, symbolic links followed.
+        read_task: returns support and query, for a layout with splits of its own; called with a folder, the name of the
+            task, the factor and the root. If None, views alternate between support and query.
     """
 
     found: Callable[[Path], object]
@@ -55,7 +56,7 @@ def _layout(
     read: Callable[[Path, Path], Listing],
     read_task: Callable[[Path, str, int | None, Path], PosedTask] | None = None,
 ) -> Layout:
-    """A layout whose files list pictures: `read` gets a folder and the root that no file may lie outside of."""
+    """A layout whose files list images. `read` is called with a folder and the root that no file may lie outside."""
     return Layout(found, lambda folder, downscale, root: assemble(read(folder, root), downscale)[0], read_task)
 
 
@@ -82,26 +83,26 @@ LAYOUTS = (
 
 
 def find_layouts() -> tuple[Layout, ...]:
-    """The layouts of this package, then those that entry points of the group `hyperplanes.layouts` name."""
+    """The layouts of this package, followed by those of entry points in the group `hyperplanes.layouts`."""
     return (*LAYOUTS, *load_entries("hyperplanes.layouts").values())
 
 
 def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
-    """The catalogue of whatever lies at a path.
+    """The catalogue of the data set at a path.
 
-    A manifest.json that names its layout decides, otherwise the folder's content: a posed scene (one object, in the
-    test split), SRN's, learnit's, the HyperPlanes authors', NMR's, CO3D's, Objaverse's or OmniObject3D's layout, or a
-    folder of posed scenes (all in the test split).
+    The layout is native if manifest.json says so. Otherwise it is recognised from the folder's content: SRN's,
+    learnit's, the HyperPlanes authors', NMR's, CO3D's, Objaverse's or OmniObject3D's layout, a posed scene (one object,
+    in the test split), or a folder of posed scenes (all in the test split).
 
     Args:
-        path: a folder, or a transforms file.
-        legacy: of learnit's and the authors' layouts, as in `npz.read_npz`.
+        path: a folder, a transforms file, or the .npz file of one object.
+        legacy: for learnit's and the authors' layouts, as in `npz.read_npz`.
 
     Returns:
-        The catalogue; no picture has been read yet.
+        The catalogue. No image has been read yet.
 
     Raises:
-        DataError: nothing that is known lies there, or another layout than these two with `legacy`.
+        DataError: no known layout, or `legacy` with another layout than these two.
     """
     path = Path(path)
     found = _find_catalogue(path, legacy)
@@ -140,14 +141,14 @@ def _find_catalogue(path: Path, legacy: bool) -> Catalogue:
 
 
 def read_posed(path: str | Path, downscale: int | None = None) -> Posed:
-    """All posed pictures of one scene.
+    """All posed images of one scene.
 
     Args:
-        path: a transforms*.json, the .npz of one object, or the folder of a scene in any layout.
+        path: a transforms*.json, the .npz file of one object, or the folder of a scene in any layout.
         downscale: as in `frames.assemble`.
 
     Returns:
-        The pictures in the order of the files. Anything wrong with a file is a DataError.
+        The images in the order of the files. Raises DataError if a file is missing or malformed.
     """
     path = Path(path)
     if path.is_file() and path.suffix == ".npz":
@@ -158,15 +159,15 @@ def read_posed(path: str | Path, downscale: int | None = None) -> Posed:
 
 
 def read_posed_task(path: str | Path, downscale: int | None = None, *, legacy: bool = False) -> PosedTask:
-    """Support and query of one scene: as its files split it, or views in turn.
+    """Support and query of one scene, split as its files state, otherwise alternately.
 
     Args:
-        path: as in `read_posed`; to transforms_train.json, _val or _test belong those beside it.
+        path: as in `read_posed`. If it is transforms_train.json, _val or _test, the others beside it are read too.
         downscale: as in `frames.assemble`.
-        legacy: of an .npz, as in `npz.read_npz`.
+        legacy: for an .npz file, as in `npz.read_npz`.
 
     Returns:
-        The task, named as by `scene_name`. Anything wrong with a file is a DataError.
+        The task, named as by `scene_name`. Raises DataError if a file is missing or malformed.
     """
     path = Path(path)
     folder, name = path, scene_name(path)
@@ -180,7 +181,7 @@ def read_posed_task(path: str | Path, downscale: int | None = None, *, legacy: b
 
 
 def scene_name(path: Path) -> str:
-    """What one scene is called: an .npz file by its own name, other files and folders by that of the folder."""
+    """The name of a scene: that of its .npz file, otherwise that of its folder."""
     if path.is_file() and path.suffix == ".npz":
         return path.stem
     return (path.parent if path.is_file() else path).resolve().name
@@ -193,16 +194,17 @@ def _one_scene(path: Path, legacy: bool = False) -> Catalogue:
 
 
 def _read_child(root: Path, name: str) -> PosedTask:
-    """A scene of a folder of scenes; its links may lead to other places in that folder."""
+    """A scene in a folder of scenes. Its symbolic links may lead anywhere in the folder of scenes."""
     return _format(root / name).task(root / name, name, None, root)
 
 
 def is_scene(folder: str | Path) -> bool:
-    """Whether a folder holds one posed scene in a layout that is read."""
+    """Whether a folder holds one posed scene in a known layout."""
     return _find_format(Path(folder)) is not None
 
 
 def _find_format(folder: Path) -> Layout | None:
+    """The layout of a folder, None if it is unknown."""
     return next((each for each in find_layouts() if each.found(folder)), None)
 
 
@@ -210,7 +212,7 @@ def _format(folder: Path) -> Layout:
     """The layout of a folder.
 
     Raises:
-        DataError: none that is known.
+        DataError: the layout is unknown.
     """
     found = _find_format(folder) if folder.is_dir() else None
     if found is not None:

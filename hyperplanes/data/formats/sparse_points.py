@@ -1,4 +1,4 @@
-"""The points of a sparse reconstruction, where one lies beside the cameras: COLMAP's, or a PLY file of places alone."""
+"""Read the points of a sparse reconstruction beside the cameras: COLMAP's, or a PLY file with positions alone."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class SparsePoints:
     """Points that structure from motion found.
 
     Attributes:
-        places: (point, 3) in the world of the cameras.
-        count: of the points; may be more than the places that are known.
-        error: mean reprojection error in pixels, None where nothing says it.
-        errors: of the points that a picture shows, their mean, by its name; empty where nothing says it.
+        places: positions (point, 3) in the world of the cameras.
+        count: number of points.
+        error: reprojection error in pixels, the mean over all observations of points; None if it is unknown.
+        errors: mean reprojection error of the points that an image shows, by the name of the image; empty if unknown.
     """
 
     places: npt.NDArray[np.float64]
@@ -38,11 +38,11 @@ def read_sparse_points(folder: str | Path) -> SparsePoints | None:
     """The points beside the cameras of a scene.
 
     Args:
-        folder: of the scene: COLMAP's project or model with points3D.bin or .txt, or a transforms.json that names a
-            PLY file as `ply_file_path`, as nerfstudio and `capture` write.
+        folder: of the scene: a COLMAP project or model with points3D.bin or .txt, or one with a transforms.json that
+            names a PLY file as `ply_file_path`, as nerfstudio and `capture` write.
 
     Returns:
-        The points, None where there are none. A broken file is a DataError.
+        The points, None if there are none. Raises DataError for a malformed file.
     """
     folder = Path(folder)
     transforms = find_transforms(folder)
@@ -82,7 +82,7 @@ def _of_colmap(model: Path, path: Path, root: Path) -> SparsePoints:
 
 
 Point = tuple[tuple[float, ...], float, set[int]]
-"""Its place, its mean reprojection error, and the numbers of the images that show it."""
+"""The position of a point, its mean reprojection error, and the numbers of the images that show it."""
 
 
 def _binary(data: bytes) -> list[Point]:

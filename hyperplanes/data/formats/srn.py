@@ -29,33 +29,32 @@ def is_srn(folder: Path) -> bool:
 
 
 def read_srn(folder: Path, root: Path, bounds: Sphere | None = None) -> Posed:
-    """The posed pictures of one object.
+    """The posed images of one object.
 
-    Poses are OpenCV camera-to-world. The pictures have no alpha: where every pixel of their border is white, masks are
-    made from what is not purely white, as pixelNeRF does; otherwise there are none. The principal point counts from the
-    pictures' borders (half-pixel centres) and is scaled with the focal length when the pictures have another size than
-    the file says.
+    Poses are camera-to-world with OpenCV axes. If the images have no transparent pixels and every border pixel is
+    white, the masks are the pixels that are not exactly white, as in pixelNeRF. The principal point is at half-pixel
+    centres. It and the focal length are scaled if the images have another size than the file states.
 
     Args:
         folder: with intrinsics.txt, rgb and pose.
-        root: no file may lie outside of it, symbolic links followed.
-        bounds: of the scene; estimated when None.
+        root: no file may lie outside it, symbolic links followed.
+        bounds: of the scene; if None, they are estimated.
 
     Returns:
-        The pictures in the order of their names.
+        The images in the order of their names.
 
     Raises:
-        DataError: anything wrong with a file.
+        DataError: a file is missing or malformed.
     """
     pictures = list_files(folder / "rgb", _SUFFIXES, root)
     if not pictures:
-        raise DataError(folder / "rgb", "pictures", "none", "download the object again")
+        raise DataError(folder / "rgb", "images", "none", "download the object again")
     poses = [folder / "pose" / f"{path.stem}.txt" for path in pictures]
     size = image_size(pictures[0])
     pixels = [read_image(path, size) for path in pictures]
     rgba = [picture for picture, _ in pixels]
     alpha = any(has_alpha and (picture[..., 3] < 255).any() for picture, has_alpha in pixels)
-    # objects rendered over white, without alpha: what is exactly white is background
+    # objects rendered over white, without alpha: exactly white pixels are background
     if not alpha and all(_white_border(picture) for picture in rgba):
         alpha = True
         for picture in rgba:
@@ -79,7 +78,7 @@ def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
     """The catalogue of a folder with CLASS_train, CLASS_val and CLASS_test, or of one of these, or of one object.
 
     Returns:
-        The catalogue, views alternating between support and query; None when it is something else.
+        The catalogue, whose views alternate between support and query; None if the folder is in another layout.
     """
     if is_srn(folder):
         homes = {"test": [folder]}
@@ -105,18 +104,21 @@ def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
 
 
 def _objects(folder: Path) -> list[Path]:
+    """The folders of the objects in a folder."""
     found = sorted(child for child in folder.iterdir() if child.is_dir() and is_srn(child))
-    if not found:  # SRN's published chairs lie a level deeper
+    if not found:  # SRN's published chairs are nested one level deeper
         found = [deeper for child in sorted(folder.glob("*_2.0_*")) for deeper in _objects(child)]
     return found
 
 
 def _white_border(picture: npt.NDArray[np.uint8]) -> bool:
+    """Whether all pixels at the border of an image are white."""
     rows, columns = picture[[0, -1], :, :3], picture[:, [0, -1], :3]
     return bool((rows == 255).all() and (columns == 255).all())
 
 
 def _intrinsics(path: Path, size: tuple[int, int], root: Path) -> npt.NDArray[np.float64]:
+    """The calibration, integer pixel centres, of images of (height, width)."""
     expected = "f cx cy first and height width last"
     lines = read_rows(path, expected, root)
     with malformed(path, expected):

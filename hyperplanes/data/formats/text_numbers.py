@@ -1,4 +1,4 @@
-"""Numbers in text files: poses, calibrations and boxes as SRN, NSVF and their like write them."""
+"""Read numbers from text files: poses, calibrations and boxes of layouts such as SRN's and NSVF's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hyperplanes.utilities.files import DataError, malformed, read_text
 __all__ = ["LARGEST_TEXT", "read_numbers", "read_rows"]
 
 LARGEST_TEXT = 2**20
-"""Bytes above which a file of a few numbers is refused unread."""
+"""Largest size in bytes of a file of numbers; a larger file is not read."""
 
 _REMEDY = "download it again"
 
@@ -27,10 +27,10 @@ def read_rows(path: Path, expected: str, root: Path) -> list[list[float]]:
         root: as in `files.check_regular`.
 
     Returns:
-        Any numbers, those that are not finite too.
+        The numbers, which may be infinite or NaN.
 
     Raises:
-        DataError: no such file, not a regular one, too large, or something else than numbers.
+        DataError: no such file, not a regular file, too large, or content that is not numbers.
     """
     if not path.exists():
         raise DataError(path, expected, "nothing", _REMEDY)
@@ -40,7 +40,7 @@ def read_rows(path: Path, expected: str, root: Path) -> list[list[float]]:
 
 
 def read_numbers(path: Path, counts: Sequence[int], root: Path) -> npt.NDArray[np.float64]:
-    """All numbers of a file, as many as one of `counts` and finite; as `read_rows`."""
+    """All numbers of a file, which must be finite and as many as one of `counts`; otherwise as `read_rows`."""
     expected = f"{' or '.join(map(str, counts))} finite numbers"
     values = np.array([value for row in read_rows(path, expected, root) for value in row], dtype=np.float64)
     if len(values) not in counts or not np.isfinite(values).all():

@@ -1,7 +1,8 @@
-"""Write transforms.json as nerfstudio names its fields, and read its numbers; numpy only, no pictures.
+"""Write transforms.json with nerfstudio's fields, and read its numbers; with NumPy alone and without images.
 
-On disk: OpenGL camera-to-world poses (x right, y up, z backwards), half-pixel centres, so that a centred principal
-point is (W / 2, H / 2). In memory: OpenCV axes, integer pixel centres. Only this module knows both.
+On disk, poses are camera-to-world with OpenGL axes (x right, y up, z backwards), and pixel centres are half-integers,
+so that a centred principal point is (W / 2, H / 2). In memory, axes are OpenCV's and pixel centres are integers. This
+module converts between the two.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from hyperplanes.utilities.files import DataError
 
 __all__ = ["calibration", "number", "opencv_from_opengl", "stated_size", "transforms_document"]
 
-_NOT_PERSPECTIVE = ("is_fisheye", "ortho")  # fields by which instant-ngp marks other cameras
-_NO_DISTORTION = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL"}
+_NOT_PERSPECTIVE = ("is_fisheye", "ortho")  # fields by which instant-ngp marks cameras that are not perspective
+_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL"}
 
 
 def transforms_document(
@@ -38,13 +39,13 @@ def transforms_document(
         world_from_camera: (view, 4, 4) poses, OpenCV axes.
         intrinsics: (view, 3, 3) in pixels, integer pixel centres; equal ones are written once for all frames.
         size: (height, width).
-        file_paths: of the pictures, relative to the file.
-        near_far: distances before and after which there is nothing, in world units.
-        sphere: centre and radius of what bounds the scene, in world units.
+        file_paths: of the images, relative to the file.
+        near_far: distances in world units before and beyond which the scene is empty.
+        sphere: centre and radius of the sphere around the scene, in world units.
         alternating: name even views in `train_filenames` (support) and odd ones in `test_filenames` (query).
 
     Returns:
-        A JSON-able dictionary.
+        A dictionary that can be written as JSON.
 
     >>> document = transforms_document(np.eye(4)[None], np.diag([2.0, 2.0, 1.0])[None], (1, 1), ["0.png"])
     >>> document["cx"], document["frames"][0]["transform_matrix"][2]
@@ -73,7 +74,7 @@ def transforms_document(
 
 
 def opencv_from_opengl(world_from_camera: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """camera_from_world (view, 4, 4) in OpenCV axes from OpenGL camera-to-world; exact inverse of a rigid motion.
+    """camera_from_world (view, 4, 4) with OpenCV axes, from rigid camera-to-world poses with OpenGL axes.
 
     >>> opencv_from_opengl(np.eye(4)[None])[0].diagonal().tolist()
     [1.0, -1.0, -1.0, 1.0]
@@ -87,25 +88,25 @@ def calibration(
     """The (3, 3) calibration, integer pixel centres, that a transforms.json or one frame of it states.
 
     Args:
-        fields: the document, a frame's own fields laid over it.
-        size: (height, width) of the picture, to which the numbers are scaled when `w` and `h` say another.
+        fields: the fields of the document, overridden by those of a frame.
+        size: (height, width) of the image. The numbers are scaled to it if `w` and `h` state another size.
         source: the file, for messages.
         legacy: take the stated principal point as one at integer pixel centres, as learnit's and the HyperPlanes
-            authors' code does: half a pixel away from where the pictures were rendered.
+            authors' code does, half a pixel away from that of the rendering.
 
     Returns:
         The matrix in float64.
 
     Raises:
-        DataError: no focal length, one that is not positive, or a camera that is no pinhole.
+        DataError: no focal length, one that is not positive, or a camera that is not perspective.
     """
     height, width = size
     model = fields.get("camera_model", "OPENCV")
-    if model not in _NO_DISTORTION and model != "FULL_OPENCV":
+    if model not in _PERSPECTIVE and model != "FULL_OPENCV":
         raise DataError(str(source), "a perspective camera_model", repr(model), "undistort the images first")
     for name in _NOT_PERSPECTIVE:
         if fields.get(name):
-            raise DataError(str(source), f"perspective cameras, without {name}", "it set", "undistort the images first")
+            raise DataError(str(source), "perspective cameras", f"{name} set", "undistort the images first")
     stated = _stated(fields, size, source)
     scale = (width / stated[0], height / stated[1])
     if "fl_x" in fields:
@@ -129,14 +130,14 @@ def calibration(
 
 
 def stated_size(fields: dict[str, Any], source: object) -> tuple[int, int] | None:
-    """(height, width) of the pictures for which a file's numbers were made, None where it does not say both.
+    """The (height, width) of images that a file states, None if it does not state both.
 
     Args:
         fields: as in `calibration`.
         source: the file, for messages.
 
     Returns:
-        Whole pixels. A size that is no positive number is a DataError.
+        Whole pixels. Raises DataError for a size that is not a positive number.
     """
     if "w" not in fields or "h" not in fields:
         return None
@@ -145,7 +146,7 @@ def stated_size(fields: dict[str, Any], source: object) -> tuple[int, int] | Non
 
 
 def _stated(fields: dict[str, Any], size: tuple[int, int], source: object) -> tuple[float, float]:
-    """Stated width and height, those of the picture where absent."""
+    """The stated width and height; those of the image if they are absent."""
     stated = number(fields, "w", size[1], source), number(fields, "h", size[0], source)
     if min(stated) <= 0:
         raise DataError(str(source), "positive w and h", f"{stated[0]:g} x {stated[1]:g}", "correct the file")
@@ -153,6 +154,7 @@ def _stated(fields: dict[str, Any], size: tuple[int, int], source: object) -> tu
 
 
 def _numbers(matrix: npt.NDArray[np.float64]) -> dict[str, float]:
+    """The fields of a calibration at half-pixel centres, from one at integer pixel centres."""
     return {
         "fl_x": float(matrix[0, 0]),
         "fl_y": float(matrix[1, 1]),
@@ -167,7 +169,7 @@ def number(fields: dict[str, Any], name: str, default: float, source: object) ->
     Args:
         fields: as in `calibration`.
         name: of the field.
-        default: where it is absent.
+        default: the result if the field is absent.
         source: the file, for messages.
 
     Raises:
@@ -180,6 +182,7 @@ def number(fields: dict[str, Any], name: str, default: float, source: object) ->
 
 
 def _angle(fields: dict[str, Any], name: str, source: object) -> float:
+    """A stated angle in radians between 0 and pi."""
     value = number(fields, name, 0.0, source)
     if not 0 < value < math.pi:
         raise DataError(str(source), f"{name} in radians between 0 and pi", f"{value:g}", "correct the file")

@@ -1,4 +1,4 @@
-"""transforms.json: nerfstudio's, Blender's (NeRF synthetic) and the native one, to posed pictures."""
+"""Read posed images from transforms.json: nerfstudio's, Blender's (NeRF synthetic) and that of native data sets."""
 
 from __future__ import annotations
 
@@ -46,19 +46,19 @@ def read_transforms(
     bounds: Sphere | None = None,
     root: Path | None = None,
 ) -> Listing:
-    """The posed pictures of one scene.
+    """The posed images of one scene.
 
-    Distorted pictures (k1, k2, k3, p1, p2 not zero) are undistorted with the same calibration. An alpha channel, or the
-    pictures that `mask_path` names, or those of a folder masks/ beside the file, become the masks.
+    Images with distortion coefficients (k1 to k6, p1, p2) are undistorted with the same calibration. Masks are the
+    alpha channel, the images that `mask_path` names, or those in a folder masks/ beside the file.
 
     Args:
-        path: a transforms file, or several of one folder that are read as one scene.
+        path: a transforms file, or several files of one folder that are read as one scene.
         legacy: as in `calibration`.
-        bounds: of the scene; "scene_sphere" of the file when None.
-        root: no picture may lie outside of it, symbolic links followed; the file's folder when None.
+        bounds: of the scene; if None, "scene_sphere" of the file.
+        root: no image may lie outside it, symbolic links followed; if None, the file's folder.
 
     Returns:
-        The pictures of all frames in the order of the files. Anything wrong with a file is a DataError that names it.
+        The images of all frames in the order of the files. Raises a DataError that names a malformed file.
     """
     paths = [Path(path)] if isinstance(path, (str, Path)) else list(path)
     return _listed(paths, legacy, bounds, root)[0]
@@ -76,11 +76,12 @@ def read_transforms_task(
 ) -> PosedTask:
     """Support and query of one scene.
 
-    transforms_train.json is the support and transforms_test.json (or _val) the query where they are; in one
-    transforms.json, `train_filenames` and `test_filenames` decide; otherwise views alternate, the first one support.
+    transforms_train.json is the support and transforms_test.json (or _val) the query, if these files exist. A single
+    transforms.json is split by its `train_filenames` and `test_filenames` (or `val_filenames`). Without these, views
+    alternate between support and query, beginning with support.
 
     Args:
-        path: the folder that holds the files, or one file that is all there is.
+        path: the folder that holds the files, or a single file.
         name: of the object.
         legacy: as in `calibration`.
         bounds: as in `read_transforms`; an estimate uses the views of the support alone.
@@ -92,7 +93,7 @@ def read_transforms_task(
         The two halves with the same bounds.
 
     Raises:
-        DataError: no transforms file, no view in one half, or anything wrong with a file.
+        DataError: no transforms file, no view in one half, or a malformed file.
     """
     files = [path] if (path := Path(path)).is_file() else find_transforms(path)
     if not files:
@@ -109,15 +110,15 @@ def read_transforms_task(
     halves = [[at for at, index in enumerate(kept) if (index in query) == asked] for asked in (False, True)]
     if not all(halves):
         found = f"{len(halves[0])} to train and {len(halves[1])} to test on"
-        remedy = "copy the pictures to where the files name them, each in one split alone"
-        raise DataError(listing.source, "pictures of both splits", found, remedy)
+        remedy = "copy the images to the paths that the files state, each in only one split"
+        raise DataError(listing.source, "images of both splits", found, remedy)
     return PosedTask.split(scene, halves[0], halves[1], name)
 
 
 def _split_by_names(
     document: dict[str, Any], frames: Sequence[Frame], path: Path
 ) -> tuple[Sequence[Frame], range | None]:
-    """The frames that train_filenames and test_filenames name, and which of them are the query; None: no such lists."""
+    """The frames that train_filenames and test_filenames name, and which of them are the query; None without lists."""
     halves = [document.get(f"{half}_filenames") for half in ("train", "test")]
     if not document.get("test_filenames") and isinstance(document.get("val_filenames"), list):
         halves[1] = document["val_filenames"]
@@ -133,7 +134,7 @@ def _split_by_names(
 def _listed(
     paths: list[Path], legacy: bool, bounds: Sphere | None, root: Path | None
 ) -> tuple[Listing, dict[str, Any], int]:
-    """What all files list, the first of them, and how many frames that has."""
+    """What all files list, the content of the first file, and its number of frames."""
     documents = [read_json(one, root or one.parent) for one in paths]
     parts = [_frames(path, document, legacy, root) for path, document in zip(paths, documents, strict=True)]
     first, document = paths[0], documents[0]
@@ -147,6 +148,7 @@ def _listed(
 
 
 def _frames(path: Path, document: dict[str, Any], legacy: bool, root: Path | None) -> list[Frame]:
+    """The frames of a file; masks are those that it names, otherwise those in masks/ beside it."""
     listed = document.get("frames")
     if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
         found = f"{len(listed)} of them" if isinstance(listed, list) else repr(listed)[:40]
@@ -160,18 +162,19 @@ def _frames(path: Path, document: dict[str, Any], legacy: bool, root: Path | Non
 
 
 def _frame(path: Path, fields: dict[str, Any], legacy: bool, root: Path) -> Frame:
+    """One frame of a file, from its own fields and those of the document."""
     written = fields.get("file_path")
     if not isinstance(written, str) or not written:
         raise DataError(path, "a file_path in every frame", repr(written), "export the file again")
     beside, as_written = path.parent / PurePosixPath(written.replace("\\", "/")).name, True
     try:
         located = _located(path, written, root)
-    except DataError:  # a folder elsewhere, whose pictures may have come with the file
+    except DataError:  # outside the root: the image may have been copied beside the file
         if not any(beside.with_name(beside.name + suffix).is_file() for suffix in ("", *_SUFFIXES)):
             raise
         located, as_written = beside, False
     if not located.is_file():
-        homes = located.parent, located.parent / "images", path.parent  # as written, OmniObject3D's, learnit's
+        homes = located.parent, located.parent / "images", path.parent  # as written, as in OmniObject3D, as in learnit
         candidates = [home / (located.name + suffix) for home in homes for suffix in ("", *_SUFFIXES)]
         located = next((candidate for candidate in candidates if candidate.is_file()), located)
         check_link(located, root)
@@ -191,7 +194,10 @@ def _frame(path: Path, fields: dict[str, Any], legacy: bool, root: Path) -> Fram
 
 
 def _lens(fields: dict[str, Any], picture: Path, path: Path) -> tuple[float, ...]:
-    """OpenCV's coefficients. nerfstudio's k4 is that of Brown's r^8, but for OpenCV's own model with a quotient."""
+    """OpenCV's distortion coefficients of a frame.
+
+    k4 is the coefficient of r^8 in Brown's model, as in nerfstudio, unless the camera has OpenCV's rational model.
+    """
     stated = tuple(number(fields, name, 0.0, path) for name in COEFFICIENTS)
     k1, k2, p1, p2, k3, k4, k5, k6 = stated
     if not k4 or k5 or k6 or fields.get("camera_model") == "FULL_OPENCV":
@@ -204,7 +210,7 @@ def _lens(fields: dict[str, Any], picture: Path, path: Path) -> tuple[float, ...
 
 
 def _located(path: Path, name: object, root: Path) -> Path:
-    """Where a name that a file writes leads to; names stay below its folder, links below the root."""
+    """The path of a name in a file. The name must stay in the file's folder, and a symbolic link in the root."""
     text = name.replace("\\", "/") if isinstance(name, str) else ""
     if ".." in PurePosixPath(text).parts or root == path.parent:
         return inside(path.parent, name, path)  # type: ignore[arg-type]
@@ -212,6 +218,7 @@ def _located(path: Path, name: object, root: Path) -> Path:
 
 
 def _chosen(document: dict[str, Any], frames: Sequence[Frame], only: Sequence[str], path: Path) -> list[Frame]:
+    """The frames with given names, in the order of these."""
     listed = zip(document["frames"], frames, strict=True)
     by_name = {str(PurePosixPath(each["file_path"])): frame for each, frame in listed}
     chosen = []

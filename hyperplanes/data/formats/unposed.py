@@ -1,4 +1,4 @@
-"""What is not posed images yet, and how it becomes so: photographs alone, videos, and packed exports of apps."""
+"""Detect inputs without poses (photographs, videos, archives of apps), and say how to make posed images of them."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from hyperplanes.utilities.shell import command_line
 __all__ = ["find_video", "photographs_folder", "refuse_unposed"]
 
 _HOMES = (".", "images", "input", "rgb", "photos", "image", "rgbd", "keyframes/images")
-_COUNTED = 10_000  # entries of a folder that are looked at
+_COUNTED = 10_000  # most entries of a folder that are counted
 _PHOTOGRAPHS = PICTURE_SUFFIXES | HEIF_SUFFIXES
 _PACKED = frozenset({".zip", ".r3d"})  # Record3D's .r3d is a ZIP archive
 
 
 def refuse_unposed(path: Path) -> None:
-    """Say what is missing where a path holds something that posed images can be made from.
+    """Raise an error that says what to do if posed images can be made from what a path holds.
 
     Raises:
-        DataError: photographs without poses, a video, or an archive.
+        DataError: the path holds photographs without poses, a video, or an archive.
     """
     packed = _packed(path)
     if packed is not None:
@@ -41,7 +41,7 @@ def refuse_unposed(path: Path) -> None:
 
 
 def _packed(path: Path) -> Path | None:
-    """The archive that lies there, alone in its folder where a folder is given."""
+    """The archive at a path: the file itself, or the only file in the folder; None if there is none."""
     if path.is_file():
         return path if path.suffix.lower() in _PACKED else None
     children = [child for _, child in zip(range(2), path.iterdir(), strict=False)] if path.is_dir() else []
@@ -49,19 +49,19 @@ def _packed(path: Path) -> Path | None:
 
 
 def photographs_folder(path: Path) -> Path | None:
-    """The folder that holds photographs: the one given, or images/ or the like in it; None where none does."""
+    """The folder with photographs: the given one, or one such as images/ in it; None if there are none."""
     homes = (path / name for name in _HOMES)
     return next((home for home in homes if home.is_dir() and _count(home)), None)
 
 
 def find_video(path: Path) -> Path | None:
-    """The video at a path: the file itself, or the first one in the folder; None where there is none."""
+    """The video at a path: the file itself, or the first one in the folder; None if there is none."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     return next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES and file.is_file()), None)
 
 
 def _photographs(path: Path) -> tuple[Path, int]:
-    """The folder of photographs, and how many there are."""
+    """The folder of photographs, and their number."""
     if path.is_file():
         return path.parent, int(path.suffix.lower() in _PHOTOGRAPHS)
     home = photographs_folder(path)

@@ -1,1 +1,1 @@
-"""What every reader shares: pictures and masks from files, without their lens, of one size and with their poses."""
+"""What all readers share: images and masks from files, undistorted, of one size and with their poses."""

@@ -1,4 +1,4 @@
-"""The sphere around what posed pictures show, when the files do not say."""
+"""Estimates of the sphere around a scene, for files that do not state one."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ __all__ = [
 HULL_SIDE = 48
 HULL_MARGIN = 1.05
 FEWEST_MASKS = 3
-MOST_MASKS = 24  # the hull of fewer views is only larger
+MOST_MASKS = 24  # views used: the hull of fewer views is only larger
 LARGEST_MASK = 256
-BORDER = 0.9  # of the pixels at the border of a picture, which an inverted mask covers
-OFTEN_CUT = 0.1  # of the masks reach the border of their picture
-ROOM = 3.0  # times the radius of the sphere from the cameras, where that is so
-WHOLE, SHOWN = 0.9, 0.25  # of the pictures that show the object whole, or of all where too few do
+BORDER = 0.9  # of the pixels at the image border, which an inverted mask covers at least
+OFTEN_CUT = 0.1  # of the masks: a larger share at the border of their image counts as a scene of close-ups
+ROOM = 3.0  # radii of the sphere from the cameras: where the hull of such a scene is searched
+WHOLE, SHOWN = 0.9, 0.25  # of the images that show the object whole, or of all images, that must show a point
 
 
 def estimate_bounds(
@@ -45,24 +45,27 @@ def estimate_bounds(
     alpha: UInt8[Tensor, "view 1 height width"] | None = None,
     depths: Float[Tensor, "view 2"] | None = None,
 ) -> Sphere:
-    """A sphere that holds what the cameras look at.
+    """A sphere that contains what the cameras look at.
 
-    From the cameras alone: the centre is the point nearest to all optical axes; the radius is what the narrowest
-    camera still sees whole at that distance, r = d sin(half the opening angle), taken over the cameras' median and
-    never reaching a camera. With masks of three views or more, the visual hull is carved inside that sphere (twice,
-    the second time inside the sphere around the first hull); the result is the sphere around its voxels, 5 % larger,
-    and never larger than the one from the cameras. Where the cameras look past each other, as forward-facing ones do,
-    the centre lies ahead of them, in the middle of the depths that are known.
+    From the cameras alone, the centre is the point nearest to all optical axes. The radius is that of the largest
+    sphere that a camera at distance d sees whole, r = d sin(half the smaller field of view): the median over the
+    cameras, and at most 95 % of the distance of the nearest camera. If the known depths show that a quarter of the
+    cameras or more do not look at this centre, as in forward-facing scenes, the centre is the median of the points
+    ahead of the cameras in the middle of their depths.
 
-    A mask that ends at the border of its picture is no outline there. Where such masks are not rare, as with close-ups,
-    the sphere from the cameras says nothing either: the hull is carved in one three times as large, out of what
-    nearly all pictures that show the object whole have within their borders, and may be larger.
+    With masks of three views or more, the visual hull is carved inside that sphere, and again inside the sphere around
+    the first hull. The result is the sphere around its voxels, 5 % larger, and at most as large as the one from the
+    cameras.
 
-    Masks seen through a lens are not carved with: the sphere is then the one from the cameras.
+    A mask that is cut off by the border of its image is no outline there. If more than a tenth of the masks are, as in
+    close-ups, the object may be larger than the sphere from the cameras. The hull is then carved in a sphere three
+    times as large, and only its points that `are_shown` accepts count.
+
+    Masks of cameras with lens distortion are not used; the result is then the sphere from the cameras.
 
     Args:
         cameras: of one scene.
-        alpha: their masks, or None where the pictures have none.
+        alpha: their masks, or None if the images have none.
         depths: nearest and farthest distance of what each camera shows, or None.
     """
     outer = _from_cameras(cameras, depths)
@@ -72,24 +75,24 @@ def estimate_bounds(
     masks, small = _reduced(alpha[chosen], camera.select(cameras, chosen))
     ends = cut_off(masks)
     cut = float(ends.float().mean()) > OFTEN_CUT
-    sphere = room = Sphere(outer.centre, ROOM * outer.radius) if cut else outer
+    sphere = largest = Sphere(outer.centre, ROOM * outer.radius) if cut else outer
     for _ in range(3 if cut else 2):
         points = carve(masks, small, sphere, HULL_SIDE).centres()
         points = points[sphere.normalise(points).norm(dim=-1) <= 1]
         points = points[are_shown(points, small, ends)] if cut else points
         if not len(points):
-            return outer if sphere is room else sphere
+            return outer if sphere is largest else sphere
         ball = smallest_ball(points)
         radius = HULL_MARGIN * (ball.radius + sphere.radius / HULL_SIDE * 3**0.5)
-        sphere = Sphere(ball.centre, min(radius, room.radius))
+        sphere = Sphere(ball.centre, min(radius, largest.radius))
     return sphere
 
 
 def cut_off(masks: Float[Tensor, "view 1 height width"]) -> Bool[Tensor, " view"]:
-    """Which masks reach the border of their picture.
+    """Which masks reach the border of their image.
 
-    A single pixel that is hardly opaque counts: a view that is taken to show the object whole bounds it. For the
-    weights of colours, where a few pixels do no harm, `geometry.visibility.margins` asks for more.
+    A single pixel that is hardly opaque suffices, because a view that counts as showing the object whole limits the
+    sphere. `geometry.visibility.margins`, which is for the blending weights of colours, tolerates a few pixels.
     """
     opaque = masks[:, 0] > 0
     sides = [opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]]
@@ -99,10 +102,10 @@ def cut_off(masks: Float[Tensor, "view 1 height width"]) -> Bool[Tensor, " view"
 def inverted(
     masks: Float[Tensor, "view 1 height width"] | UInt8[Tensor, "view 1 height width"],
 ) -> Bool[Tensor, " view"]:
-    """Which masks seem to show the background: they cover the border of their picture, and less of what is within it.
+    """Which masks seem to mark the background: they cover the border of their image, and less of the whole image.
 
-    A close-up of an object covers its border, too. A minority of such masks is reported only if most of the other
-    masks do not reach the border.
+    A close-up of an object also covers the border. A minority of such masks is therefore reported only if most of the
+    other masks do not reach the border.
     """
     opaque = masks[:, 0] > (127 if masks.dtype == torch.uint8 else 0.5)
     border = torch.cat([opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]], -1).float().mean(-1)
@@ -116,14 +119,15 @@ def inverted(
 def are_shown(
     points: Float[Tensor, "point 3"], cameras: PinholeCamera, cut: Bool[Tensor, " view"]
 ) -> Bool[Tensor, " point"]:
-    """Whether a point may belong to the object: nearly all pictures that show it whole show the point.
+    """Whether each point may belong to the object: 90 % of the images that show the object whole show the point.
 
-    Where fewer than three do, a quarter of all pictures has to show it, and two at least.
+    If fewer than three images show the object whole, a quarter of all images must show the point. In both cases at
+    least two images must.
 
     Args:
         points: in the world.
-        cameras: of one size.
-        cut: which of them do not show the object whole.
+        cameras: of one image size.
+        cut: which images do not show the object whole.
     """
     height, width = camera.image_size(cameras)
     matrices = camera.projection_matrices(cameras)
@@ -138,13 +142,13 @@ def are_shown(
 
 
 def stated_bounds(document: dict[str, Any], path: Path) -> Sphere | None:
-    """The "scene_sphere" of a transforms.json or a manifest, or None where there is none.
+    """The field "scene_sphere" of a transforms.json or a manifest, or None if there is none.
 
     Returns:
         The sphere in the world of the poses.
 
     Raises:
-        DataError: no centre and radius, or numbers that make no sphere.
+        DataError: no centre and radius, numbers that are not finite, or a radius that is not positive.
     """
     stated = document.get("scene_sphere")
     if stated is None:
@@ -160,7 +164,7 @@ def stated_bounds(document: dict[str, Any], path: Path) -> Sphere | None:
 
 
 def nearest_point(centres: Float[Tensor, "view 3"], directions: Float[Tensor, "view 3"]) -> Float[Tensor, " 3"]:
-    """The point with the least squared distance to all lines; of parallel lines, the one nearest to their centres.
+    """The point with the least sum of squared distances to lines; for parallel lines, that nearest to their centres.
 
     >>> eyes = torch.tensor([[0.0, 0.0, 3.0], [2.0, 0.0, 0.0]])
     >>> nearest_point(eyes, torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])).round().abs().tolist()
@@ -176,7 +180,7 @@ def _from_cameras(cameras: PinholeCamera, depths: Tensor | None) -> Sphere:
     eyes, axes = camera.centres(cameras), camera.viewing_directions(cameras)
     centre = nearest_point(eyes, axes)
     if depths is not None and _look_past_it(centre, eyes, axes, depths):
-        middle = 2 / (1 / depths.to(eyes).clamp_min(1e-6)).sum(1, keepdim=True)  # halfway in the pictures: in disparity
+        middle = 2 / (1 / depths.to(eyes).clamp_min(1e-6)).sum(1, keepdim=True)  # the mean in disparity
         centre = (eyes + axes * middle).median(0).values
     distance = (eyes - centre).norm(dim=-1)
     height, width = camera.image_size(cameras)
@@ -184,13 +188,13 @@ def _from_cameras(cameras: PinholeCamera, depths: Tensor | None) -> Sphere:
     half = torch.atan(focal.new_tensor([width / 2, height / 2]) / focal).amin(-1)
     radius = float((distance * half.sin()).median())
     nearest = float(distance.min())
-    if nearest < 1e-6 or radius < 1e-6:  # all cameras in one place: look a unit ahead
+    if nearest < 1e-6 or radius < 1e-6:  # all cameras in one position: the point a unit ahead of them
         return Sphere(tuple((eyes + axes).mean(0).tolist()), 1.0)
     return Sphere(tuple(centre.tolist()), min(radius, 0.95 * nearest))
 
 
 def _look_past_it(centre: Tensor, eyes: Tensor, axes: Tensor, depths: Tensor) -> bool:
-    """Whether for a quarter of the cameras or more the centre is not within the depths that they show."""
+    """Whether the centre is outside the depths that a camera shows, for at least a quarter of the cameras."""
     ahead = ((centre - eyes) * axes).sum(-1)
     low, high = depths.to(eyes).unbind(1)
     return float(((ahead < low) | (ahead > high)).float().mean()) >= 0.25
@@ -200,9 +204,9 @@ def smallest_ball(points: Float[Tensor, "point 3"]) -> Sphere:
     """Nearly the smallest sphere around points (Badoiu and Clarkson, 2003: 100 steps are within a few percent).
 
     Args:
-        points: one or more; those of a grid, one after the other along z, take a third of the time.
+        points: one or more. Grid points that are ordered along z take a third of the time.
     """
-    # between its neighbours on a line along z no point is farthest
+    # a point between two others on a line along z is never the farthest
     step = points.diff(dim=0)
     along, up, down = (step[:, :2] == 0).all(1), step[:, 2] > 0, step[:, 2] < 0
     between = along[1:] & along[:-1] & (up[1:] & up[:-1] | down[1:] & down[:-1])
@@ -215,7 +219,7 @@ def smallest_ball(points: Float[Tensor, "point 3"]) -> Sphere:
 
 
 def _reduced(alpha: Tensor, cameras: PinholeCamera) -> tuple[Tensor, PinholeCamera]:
-    """Masks small enough to carve quickly: a coarse pixel is set where any of its fine ones is."""
+    """Masks reduced by max pooling so that carving is fast, and their cameras."""
     height, width = alpha.shape[2:]
     factor = -(-max(height, width) // LARGEST_MASK)
     if factor == 1:

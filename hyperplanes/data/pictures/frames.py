@@ -1,4 +1,4 @@
-"""From the frames that a file lists to posed pictures of one size: what every reader of photographs shares."""
+"""Read the images of the frames that a file lists, and bring them to one size; shared by the readers of photographs."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ from hyperplanes.utilities.files import DataError
 __all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "centred_matrix", "scaled_matrix"]
 
 MEGAPIXEL = 2**20
-"""Pixels above which photographs are scaled down unless the caller says by how much."""
+"""Photographs with more pixels are scaled down unless the caller gives a factor."""
 
-ENOUGH = 2 / 3  # of the frames of a file must be there
-ROUNDING = 1.01  # pixels by which a picture scaled to whole pixels may differ from the exact size
+ENOUGH = 2 / 3  # of the frames of a file: the least share with an image
+ROUNDING = 1.01  # pixels: largest difference between the size of a scaled image, in whole pixels, and the exact size
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture that a file lists, with its camera; nothing of it has been read.
+    """One image that a file lists, with its camera. The image has not been read.
 
     Attributes:
-        path: of the picture.
-        name: of the picture, relative to the folder that is read, or as the file writes it.
+        path: of the image.
+        name: of the image, relative to the folder that is read, or as the file writes it.
         camera_from_world: (4, 4), OpenCV axes, already checked.
-        calibrate: the (3, 3) calibration, integer pixel centres, for a picture of (height, width).
-        size: (height, width) of the pictures that the calibration was made for, or None where the file does not say.
-        lens: OpenCV's coefficients in the order of `undistort.COEFFICIENTS`; empty where there is none.
-        mask: a picture of its opacity, or None.
+        calibrate: returns the (3, 3) calibration, integer pixel centres, for an image of (height, width).
+        size: (height, width) of the images that the camera was calibrated for, or None if the file does not state it.
+        lens: OpenCV's distortion coefficients in the order of `undistort.COEFFICIENTS`; empty without distortion.
+        mask: an image of its opacity, or None.
         depths: nearest and farthest distance of what it shows, or None.
     """
 
@@ -65,12 +65,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class Listing:
-    """What the files of one scene say of it; no picture has been read, and none lies outside of the reader's `root`.
+    """What the files of one scene state. No image has been read, and none lies outside the reader's `root`.
 
     Attributes:
-        frames: its pictures, in the order that they are read in.
+        frames: the images, in the order in which they are read.
         source: the file that lists them, for messages.
-        bounds: of the scene; estimated when None.
+        bounds: of the scene; if None, they are estimated.
         up: as in `Views`.
         notes: as in `Posed`.
     """
@@ -84,12 +84,12 @@ class Listing:
 
 @dataclass(frozen=True)
 class _Found:
-    """A frame whose picture is there.
+    """A frame whose image exists.
 
     Attributes:
         frame: as the file lists it.
         stored: (height, width) of the pixels in the file.
-        turn: EXIF's orientation where it has to be applied, else 1.
+        turn: EXIF's orientation if it has to be applied, otherwise 1.
     """
 
     frame: Frame
@@ -103,38 +103,39 @@ class _Found:
 
 
 def assemble(listing: Listing, downscale: int | None = None, *, complete: bool = False) -> tuple[Posed, list[int]]:
-    """Read the pictures of frames and bring them to one size.
+    """Read the images of frames and bring them to one size.
 
-    Where at least two thirds of the pictures are there, the others are left out and named. So are frames whose picture
-    is listed before, links followed: no method is judged by what it was shown. Pictures of several sizes are scaled to
-    the commonest one, and their calibrations with them; those of another aspect ratio, as portraits among landscapes,
-    by another factor for each axis, so that their pixels are no longer square. EXIF's orientation is
-    applied where the size that the file states asks for it. Distorted pictures are undistorted with the same
-    calibration.
+    If at most a third of the images are missing, their frames are left out and named in the notes. So are frames whose
+    image an earlier frame lists, symbolic links followed, so that no image is both a support and a query view. Images
+    of several sizes are scaled to the most common one, and their calibrations with them. Those of another aspect ratio,
+    such as portraits among landscapes, are scaled by another factor on each axis, so that their pixels are no longer
+    square. EXIF's orientation is applied if the size that the file states requires it. Distorted images are undistorted
+    with the same calibration.
 
     Args:
-        listing: what the files say.
-        downscale: reduce the pictures by this factor, averaging pixels; None leaves a megapixel at most.
-        complete: a missing picture is an error, and nothing is scaled down unless asked for: data of ours.
+        listing: what the files state.
+        downscale: reduce the images by this factor, averaging pixels. None reduces them to at most MEGAPIXEL pixels.
+        complete: treat a missing image as an error, and do not reduce images if `downscale` is None. Readers of native
+            data sets and of learnit's layout use it.
 
     Returns:
-        The pictures, and which of the frames they are. Pictures that are missing or misfit, or a lens that folds the
-        picture, are a DataError.
+        The images, and the indices of the frames that they belong to. Raises DataError if an image is missing or does
+        not fit its camera, or if a lens folds an image.
     """
     frames, source = listing.frames, listing.source
-    # the frames that have a picture, and one size for all of them
+    # the frames that have an image, and one size for all of them
     kept, notes = _present(frames, source, complete)
     found = [_examine(frames[index], source) for index in kept]
     size = _common_size([one.size for one in found])
     if scaled := [one.frame.name for one in found if one.size != size]:
-        notes.append(f"{len(scaled)} pictures of other sizes scaled to {size[1]} x {size[0]} pixels: {listed(scaled)}")
+        notes.append(f"{len(scaled)} images of other sizes scaled to {size[1]} x {size[0]} pixels: {listed(scaled)}")
     if turns := [one.frame.name for one in found if one.turn != 1]:
-        notes.append(f"{len(turns)} pictures turned as their EXIF orientation says: {listed(turns)}")
+        notes.append(f"{len(turns)} images rotated by their EXIF orientation: {listed(turns)}")
     factor = _factor(size, downscale, complete, source)
     if factor > 1:
         why = "" if downscale else "; --downscale 1 keeps every pixel"
         notes.append(f"scaled down by {factor}, to {size[1] // factor} x {size[0] // factor} pixels{why}")
-    # each picture at that size, without its lens, and its calibration with it
+    # each image scaled to that size and undistorted, with its calibration
     pictures, alphas, matrices = [], [], []
     for one in found:
         matrix = scaled_matrix(one.frame.calibrate(one.size), one.size, (size[0] / factor, size[1] / factor))
@@ -147,7 +148,7 @@ def assemble(listing: Listing, downscale: int | None = None, *, complete: bool =
         matrices.append(matrix)
     if any(alphas) and not all(alphas):
         bare = [one.frame.name for one, alpha in zip(found, alphas, strict=True) if not alpha]
-        notes.append(f"{len(bare)} of {len(found)} pictures have no mask and count as covered: {listed(bare)}")
+        notes.append(f"{len(bare)} of {len(found)} images have no mask and are taken as opaque: {listed(bare)}")
     depths = [one.frame.depths for one in found]
     scene = posed(
         pictures,
@@ -164,7 +165,7 @@ def assemble(listing: Listing, downscale: int | None = None, *, complete: bool =
 
 
 def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tuple[list[int], list[str]]:
-    """Which frames have a picture that no frame before them has, and what to say of the others."""
+    """The indices of frames whose image exists and belongs to no earlier frame, and notes about the others."""
     there = [index for index, frame in enumerate(frames) if frame.path.exists()]
     missing = [frame for frame in frames if not frame.path.exists()]
     notes = []
@@ -173,43 +174,43 @@ def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tup
     if missing and len(there) < ENOUGH * len(frames):
         raise DataError(
             source,
-            f"the pictures of its {len(frames)} frames, or of two thirds of them",
+            f"images for at least two thirds of its {len(frames)} frames",
             f"{len(there)} ({missing[0].path} and {len(missing) - 1} others are missing)",
-            "copy the pictures to where the file names them",
+            "copy the images to the paths that the file states",
         )
     if missing:
         names = listed([frame.name for frame in missing])
-        notes.append(f"{len(there)} of {len(frames)} frames have a picture, {len(missing)} are missing: {names}")
+        notes.append(f"{len(there)} of {len(frames)} frames have an image, {len(missing)} are missing: {names}")
     first: dict[Path, int] = {}
     for index in there:
         first.setdefault(frames[index].path.resolve(), index)
     kept = list(first.values())
     if again := [frames[index].name for index in sorted({*there} - {*kept})]:
-        notes.append(f"{len(again)} frames left out, whose pictures are listed before: {listed(again)}")
+        notes.append(f"{len(again)} frames left out, whose images earlier frames list: {listed(again)}")
     return kept, notes
 
 
 def _examine(frame: Frame, source: str | Path) -> _Found:
-    """Whether the picture has to be turned; DataError where it cannot be the one that the calibration is for."""
+    """The frame and the rotation that its image needs; DataError if the camera was not calibrated for this image."""
     header = image_header(frame.path)
     if frame.size is None:
         if header.orientation != 1:
             raise DataError(
                 frame.path,
-                "pixels stored upright, as the cameras' file does not say for which size it was made",
+                "pixels stored upright, as the file of cameras states no image size",
                 f"EXIF orientation {header.orientation}",
-                "turn the pixels (mogrify -auto-orient), or drop the tag where the poses are of the stored pixels",
+                "rotate the pixels (mogrify -auto-orient), or remove the tag if the poses are of the stored pixels",
             )
         return _Found(frame, header.size, 1)
     if _same_shape(header.size, frame.size):
-        return _Found(frame, header.size, 1)  # COLMAP and nerfstudio take the pixels as they are stored
+        return _Found(frame, header.size, 1)  # COLMAP and nerfstudio ignore EXIF's orientation
     if header.orientation >= 5 and _same_shape(header.upright_size, frame.size):
         return _Found(frame, header.size, header.orientation)
     raise DataError(
         frame.path,
-        f"the shape of the {frame.size[1]} x {frame.size[0]} pixels that {Path(source).name} states",
+        f"the aspect ratio of the {frame.size[1]} x {frame.size[0]} pixels that {Path(source).name} states",
         f"{_text(header)}",
-        "give the pictures that the cameras were made for, or correct w and h",
+        "give the images that the cameras were calibrated for, or correct w and h",
     )
 
 
@@ -219,13 +220,13 @@ def _text(header: Header) -> str:
 
 
 def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one is the other scaled, but for rounding to whole pixels."""
+    """Whether one size is the other one scaled and rounded to whole pixels."""
     (height, width), (tall, wide) = size, other
     return abs(width / wide * tall - height) < ROUNDING or abs(height / tall * wide - width) < ROUNDING
 
 
 def _common_size(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
-    """The commonest size of those of the commonest shape."""
+    """The most common size among those of the most common aspect ratio."""
     counts = Counter(sizes)
     return max(counts, key=lambda each: (sum(n for s, n in counts.items() if _same_shape(s, each)), counts[each]))
 
@@ -243,12 +244,12 @@ def _factor(size: tuple[int, int], downscale: int | None, complete: bool, source
 def scaled_matrix(
     matrix: npt.NDArray[np.float64], own: tuple[float, float], size: tuple[float, float]
 ) -> npt.NDArray[np.float64]:
-    """The calibration of a picture scaled from one (height, width) to another: its borders stay in place.
+    """The calibration of an image that is scaled from one (height, width) to another, with its borders in place.
 
     Args:
         matrix: (3, 3), integer pixel centres.
-        own: the size that it was made for.
-        size: the one that is wanted, which need not be whole.
+        own: the size that the calibration is for.
+        size: the new size, which need not be in whole pixels.
     """
     scale = np.array([size[1] / own[1], size[0] / own[0]])
     result = matrix.copy()
@@ -258,7 +259,9 @@ def scaled_matrix(
 
 
 def centred_matrix(focal: float, size: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """The calibration, integer pixel centres, of a picture of (height, width) around its middle; `focal` is in widths.
+    """The calibration, integer pixel centres, of an image of (height, width) with the principal point in its middle.
+
+    `focal` is the focal length in units of the image width.
 
     >>> centred_matrix(0.5, (2, 4)).tolist()
     [[2.0, 0.0, 1.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]
@@ -268,6 +271,7 @@ def centred_matrix(focal: float, size: tuple[int, int]) -> npt.NDArray[np.float6
 
 
 def _pixels(one: _Found, size: tuple[int, int], factor: int) -> tuple[Pixels, bool]:
+    """The image of a frame, scaled to a size and then reduced by a factor, and whether its alpha is a mask."""
     picture, alpha = read_image(one.frame.path, one.stored)
     picture = turned(picture, one.turn)
     if one.frame.mask is not None and not (alpha and (picture[..., 3] < 255).any()):
@@ -277,7 +281,7 @@ def _pixels(one: _Found, size: tuple[int, int], factor: int) -> tuple[Pixels, bo
                 one.frame.mask,
                 f"{one.size[1]} x {one.size[0]} pixels, as {one.frame.path.name}",
                 f"{stored[1]} x {stored[0]}",
-                "scale the mask to the size of its picture",
+                "scale the mask to the size of its image",
             )
         values, has_alpha = read_image(one.frame.mask, stored)
         picture[..., 3] = opacity_of(values if stored == one.size else turned(values, one.turn), has_alpha)

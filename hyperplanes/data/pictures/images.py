@@ -1,4 +1,4 @@
-"""Pictures from files: checked before they are decoded, always RGBA, 8 bits."""
+"""Read images from files as RGBA with 8 bits, after a check of their headers."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ LARGEST_IMAGE = 64 * 10**6
 """Pixels above which an image is refused before it is decoded."""
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM", "JPEG2000", "HEIF")
-"""What Pillow may take a picture for, whatever it is called: for some other formats it starts other programs. It knows
-HEIF once pillow-heif has registered it."""
+"""Formats that Pillow may decode, whatever the file name; for some other formats it would start external programs. HEIF
+works once pillow-heif has registered it."""
 
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
-"""Endings, in small letters, of the files that are taken for pictures."""
+"""Lower-case suffixes of files that are taken for images."""
 
 HEIF_SUFFIXES = frozenset({".heic", ".heif"})
-"""Those of photographs that Pillow reads once pillow-heif has registered their format."""
+"""Lower-case suffixes of photographs that Pillow reads once pillow-heif has registered their format."""
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
-"""Those of the files that are taken for videos."""
+"""Lower-case suffixes of files that are taken for videos."""
 
 Pixels = npt.NDArray[np.uint8]
 
-_OVERSHOOT = 1.5  # times white, up to which floating-point numbers reach: Lanczos' scaling of a mask reaches 1.49
+_OVERSHOOT = 1.5  # largest ratio of a floating-point value to white; masks resampled by Lanczos reach 1.49
 _REMEDY = "render, export or download it again"
-_ORIENTATION = 0x0112  # of EXIF: 1 is upright, 2 to 8 are the other turns and mirrorings
+_ORIENTATION = 0x0112  # tag of EXIF: 1 is upright, 2 to 8 are the other rotations and reflections
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -68,11 +68,11 @@ _TURNS = {
 
 @dataclass(frozen=True)
 class Header:
-    """What an image says of itself before it is decoded.
+    """What the header of an image states.
 
     Attributes:
         size: (height, width) of the pixels as they are stored.
-        orientation: EXIF's number: 1 where they are stored upright, or where nothing is said.
+        orientation: EXIF's orientation, 1 if the pixels are stored upright or the header states none.
     """
 
     size: tuple[int, int]
@@ -80,35 +80,35 @@ class Header:
 
     @property
     def upright_size(self) -> tuple[int, int]:
-        """(height, width) after the turn that EXIF asks for."""
+        """(height, width) after the rotation that EXIF's orientation requires."""
         height, width = self.size
         return (width, height) if self.orientation >= 5 else self.size
 
 
 def image_header(path: str | Path) -> Header:
-    """The header of an image; DataError when there is none, or one of an absurd size."""
+    """The header of an image; raises DataError if it cannot be read, or states more than LARGEST_IMAGE pixels."""
     with _open(Path(path)) as image:
         orientation = 1
-        if "exif" in image.info:  # asking without it would decode a whole PNG
+        if "exif" in image.info:  # without this check, getexif would decode a whole PNG
             try:
                 orientation = int(image.getexif().get(_ORIENTATION, 1))
             except (TypeError, ValueError, SyntaxError, OSError):
-                orientation = 1  # a damaged tag says nothing
+                orientation = 1  # a damaged tag is ignored
         return Header((image.height, image.width), orientation if orientation in _TURNS else 1)
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """(height, width) of an image, from its header alone; DataError when there is none, or an absurd one."""
+    """(height, width) of the stored pixels of an image; raises DataError as `image_header` does."""
     return image_header(path).size
 
 
 def turned(picture: Pixels, orientation: int) -> Pixels:
-    """A picture (height, width, 4) turned and mirrored as EXIF's orientation asks for."""
+    """An image (height, width, 4) rotated and mirrored as EXIF's orientation requires."""
     return picture if orientation == 1 else np.array(Image.fromarray(picture).transpose(_TURNS[orientation]))
 
 
 def resized(picture: Pixels, size: tuple[int, int]) -> Pixels:
-    """A picture (height, width, 4) of straight alpha scaled to another size, its borders staying in place."""
+    """An image (height, width, 4) with straight alpha, scaled to another (height, width) with its borders in place."""
     if picture.shape[:2] == size:
         return picture
     scaled = Image.fromarray(picture).convert("RGBa").resize((size[1], size[0]), Image.Resampling.BILINEAR)
@@ -116,16 +116,16 @@ def resized(picture: Pixels, size: tuple[int, int]) -> Pixels:
 
 
 def check_downscale(factor: int, size: tuple[int, int], source: str | Path) -> None:
-    """Refuse a factor by which pictures of a (height, width) cannot be scaled down."""
+    """Raise DataError if images of this (height, width) cannot be scaled down by this factor."""
     if not 1 <= factor <= min(size):
-        found = f"{factor} for pictures of {size[1]} x {size[0]} pixels"
+        found = f"{factor} for images of {size[1]} x {size[0]} pixels"
         raise DataError(source, f"a downscale from 1 to {min(size)}", found, "give another --downscale")
 
 
 def reduced(picture: Pixels, factor: int) -> Pixels:
-    """A picture (height, width, 4) of straight alpha, the mean of every factor x factor pixels one pixel.
+    """An image (height, width, 4) with straight alpha, reduced by averaging blocks of factor x factor pixels.
 
-    Rows and columns at the end that fill no whole pixel are left out.
+    Rows and columns at the end that fill no whole block are left out.
     """
     if factor == 1:
         return picture
@@ -138,15 +138,16 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     """The pixels of an image.
 
     Args:
-        path: one of FORMATS; more than 8 bits a channel are scaled down to 8. Of floating-point numbers, white is the
-            first of 1, 255 and 65535 that none exceeds by more than half, as masks do that were scaled smoothly.
+        path: a file in one of FORMATS. More than 8 bits per channel are scaled down to 8. In a floating-point image,
+            white is the first of 1, 255 and 65535 that no value exceeds by more than half, since resampled masks
+            exceed white.
         size: the (height, width) that it must have, checked before decoding.
 
     Returns:
-        (height, width, 4) RGBA with straight alpha, and whether the file had an alpha channel (255 where it has not).
+        (height, width, 4) RGBA with straight alpha, and whether the file has an alpha channel (otherwise alpha is 255).
 
     Raises:
-        DataError: no such file, not an image, truncated, of another size, or absurdly large.
+        DataError: no such file, not an image, truncated, of another size, or more than LARGEST_IMAGE pixels.
     """
     path = Path(path)
     with _open(path) as image:
@@ -168,14 +169,14 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
 
 
 def opacity_of(mask: Pixels, has_alpha: bool) -> UInt8[np.ndarray, "height width"]:
-    """What a picture of a mask says: its alpha where some of it is not opaque, otherwise its brightest channel.
+    """The opacity that an image of a mask states: its alpha if some pixel is not opaque, otherwise its largest channel.
 
-    The alpha of a cut-out, a photograph whose background is transparent, is its mask. Where nothing is brighter than 1,
-    that is the object.
+    So the mask may also be a photograph whose background is transparent. If the largest value is 1, 1 marks the object
+    and becomes 255.
 
     Args:
         mask: (height, width, 4), as `read_image` returns it.
-        has_alpha: likewise.
+        has_alpha: as `read_image` returns it.
     """
     by_alpha = has_alpha and bool((mask[..., 3] < 255).any())
     opacity = mask[..., 3] if by_alpha else mask[..., :3].max(-1)
@@ -191,7 +192,7 @@ def composite_over_white(
     >>> [round(value, 3) for value in composite_over_white(pixel)[0].flatten().tolist()]
     [0.8, 1.0, 0.8]
     """
-    pixels = rgba.numpy()  # torch's threads cost more than they bring here
+    pixels = rgba.numpy()  # NumPy, since PyTorch's threads cost more time here than they save
     colour, alpha = (np.multiply(part, np.float32(1 / 255), order="C") for part in (pixels[:, :3], pixels[:, 3:]))
     colour -= 1
     colour *= alpha
@@ -200,7 +201,7 @@ def composite_over_white(
 
 
 def _white(mode: str, largest: float) -> float:
-    """The number that stands for white in a picture of one of Pillow's modes for wide numbers."""
+    """The value of white in an image of one of Pillow's modes with more than 8 bits, by its largest value."""
     if mode != "F":
         return max(65535.0, largest)
     return next((white for white in (1.0, 255.0, 65535.0) if largest <= _OVERSHOOT * white), largest)
@@ -212,12 +213,12 @@ def _open(path: Path) -> Image.Image:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             check_regular(path)
-            known = Image.OPEN.keys() | set(FORMATS[:-1])  # Pillow knows HEIF only once it has been registered
+            known = Image.OPEN.keys() | set(FORMATS[:-1])  # HEIF is in Image.OPEN only once it is registered
             image = Image.open(path, formats=[each for each in FORMATS if each in known])
     except FileNotFoundError as error:
         raise DataError(path, "an image", "nothing", "check the name, or take the frame out") from error
     except Image.DecompressionBombError as error:
-        raise DataError(path, f"at most {LARGEST_IMAGE} pixels", "far more", "scale it down") from error
+        raise DataError(path, f"at most {LARGEST_IMAGE} pixels", "more", "scale it down") from error
     except DataError:
         raise
     except PermissionError as error:
@@ -225,7 +226,7 @@ def _open(path: Path) -> Image.Image:
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(path, "an image", f"something else ({error})", _REMEDY) from error
     orientation = image.tag_v2.get(_ORIENTATION, 1) if isinstance(image, TiffImageFile) else 1
-    if orientation != 1:  # Pillow turns such files itself, and mixes up the pixels of those that are not compressed
+    if orientation != 1:  # Pillow rotates such files itself, and scrambles the pixels of uncompressed ones
         image.close()
         raise DataError(path, "a TIFF that is stored upright", f"orientation {orientation}", "save it again, as PNG")
     if image.height * image.width > LARGEST_IMAGE:

@@ -1,4 +1,4 @@
-"""Masks that lie in a folder of their own, beside photographs that have no alpha."""
+"""Masks in a folder of their own, for photographs without alpha."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ __all__ = ["find_masks", "match_masks"]
 
 
 def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path) -> list[Path | None]:
-    """The mask of each picture, found as `match_masks` does; white is what is kept.
+    """The mask of each image, found as by `match_masks`; white marks the object.
 
     Args:
-        folders: what may hold masks; the first one that exists counts.
-        pictures: their files, some of which may be missing.
+        folders: which may hold masks; the first one that exists is used.
+        pictures: the image files, some of which may be missing.
         root: as in `files.check_regular`.
 
     Returns:
-        A file a picture, None for a picture that is missing, and for all where there is no such folder.
+        A file for each image; None for a missing image, and for all images if none of the folders exists.
 
     Raises:
-        DataError: some pictures have a mask and others have none, or a link leads out of the root.
+        DataError: the folder lacks the mask of an image, or a link leads out of the root.
     """
     folder = next((folder for folder in folders if folder.is_dir()), None)
     if folder is None or not any(picture.exists() for picture in pictures):
@@ -36,27 +36,30 @@ def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path) ->
         bare = [p.name for m, p in zip(masks, pictures, strict=True) if m is None and p.exists()]
         found = f"{len(present) - len(bare)}, none for {bare[0]}"
         raise DataError(
-            folder, f"a mask for each of the {len(present)} pictures", found, "add them, or rename the folder"
+            folder, f"a mask for each of the {len(present)} images", found, "add the others, or rename the folder"
         )
     return [mask if picture.exists() else None for mask, picture in zip(masks, pictures, strict=True)]
 
 
 def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None) -> list[Path | None]:
-    """The mask of each picture, found by its name or by its number; None for those that have none.
+    """The mask of each image, matched by name or by number; None for an image without a mask.
 
-    A mask has the name of its picture with any ending, that with _mask after it, or as COLMAP has it, the name with
-    .png after the ending. Of several masks of one name in different folders it is the one whose folders have the same
-    names as those of the picture. Where no name fits, there are as many masks as pictures and all names are numbers,
-    as NeuS publishes image/000000.png beside mask/000.png, both are taken in the order of their numbers.
+    The mask of NAME.jpg may be called NAME or NAME_mask with any suffix or, as in COLMAP, NAME.jpg.png. If several
+    folders hold masks of that name, the one whose parent folders match those of the image best is taken. If no name
+    matches any image, but there are as many masks as images and all names are numbers, they are paired in numerical
+    order; NeuS, for example, publishes image/000000.png with mask/000.png.
 
     Args:
-        folder: what holds masks.
-        pictures: their files.
-        root: as in `find_masks`; the folder of the masks when None.
+        folder: the folder with the masks, which are searched in its subfolders too.
+        pictures: the image files.
+        root: as in `find_masks`; if None, the folder of the masks.
+
+    Returns:
+        A file or None for each image; only None if the folder holds no masks.
 
     Raises:
-        DataError: no mask fits any picture, several of one name have folders that fit one equally well, or a link leads
-            out of the root.
+        DataError: no mask matches any image, the parent folders of several masks match those of an image equally well,
+            or a link leads out of the root.
     """
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES)
     for path in files:
@@ -76,13 +79,13 @@ def match_masks(folder: Path, pictures: Sequence[Path], root: Path | None = None
     if any(masks):
         return masks
     if (by_number := _by_number(files, pictures)) is None:
-        remedy = "rename them as the pictures, or number as many as there are pictures"
-        raise DataError(folder, "masks named as the pictures", f"none of them for {pictures[0].name}", remedy)
+        remedy = "name the masks as the images, or number as many masks as there are numbered images"
+        raise DataError(folder, "masks named as the images", f"none for {pictures[0].name}", remedy)
     return list(by_number)
 
 
 def _of_the_same_folders(masks: Sequence[Path], picture: Path, folder: Path) -> Path:
-    """The mask in folders with the same names as those of a picture, the innermost first; the last of one folder."""
+    """The mask whose parent folders, from the innermost on, match most of those of an image; the last in its folder."""
 
     def shared(mask: Path) -> int:
         pairs = zip(reversed(mask.relative_to(folder).parent.parts), reversed(picture.parent.parts), strict=False)
@@ -95,13 +98,13 @@ def _of_the_same_folders(masks: Sequence[Path], picture: Path, folder: Path) -> 
             folder,
             f"one mask for {picture}",
             f"{len(best)}: {', '.join(mask.relative_to(folder).as_posix() for mask in best[:3])}",
-            "put the masks into folders with the same names as those of the pictures",
+            "put the masks into folders with the same names as those of the images",
         )
     return best[-1]
 
 
 def _by_number(masks: Sequence[Path], pictures: Sequence[Path]) -> list[Path] | None:
-    """The masks of pictures in the order of their numbers; None where a name is none, or their counts differ."""
+    """The masks paired with images in numerical order; None if a name is no number, or their counts differ."""
     names = [path.stem for path in (*masks, *pictures)]
     if len(masks) != len(pictures) or not all(name.isdecimal() and len(name) < 20 for name in names):
         return None

@@ -1,4 +1,4 @@
-"""Posed 8-bit pictures as every reader returns them, before they become float `Views`."""
+"""Posed 8-bit images, which all readers return and which become float `Views`."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from hyperplanes.views import Task, Views
 __all__ = ["Posed", "PosedTask", "check_pose", "posed"]
 
 ROTATION_TOLERANCE = 1e-3
-ONE_PLACE = 2.0**-21  # of their distance from the origin: cameras in one place lie so far apart by float32 rounding
-FARTHEST = 1e3  # extents of a scene from the origin, within which float32 keeps it to a tenth of a pixel
+ONE_PLACE = 2.0**-21  # of the distance from the origin: float32 rounding moves cameras at one position this far apart
+FARTHEST = 1e3  # extents of a scene: its largest distance from the origin at which float32 is exact to 0.1 pixels
 
 
 @dataclass(frozen=True)
 class Posed:
-    """Pictures and cameras of one scene, compact enough to keep many in memory.
+    """Images and cameras of one scene, compact enough to keep many in memory.
 
     Attributes:
-        rgba: straight alpha, 255 where the file had none.
-        cameras: one a picture, OpenCV axes, integer pixel centres.
-        has_alpha: whether alpha means anything.
+        rgba: with straight (not premultiplied) alpha, 255 if the files have none.
+        cameras: one per image, OpenCV axes, integer pixel centres.
+        has_alpha: whether the alpha channel holds masks.
         stated_bounds: the sphere that the files state, or None.
-        names: of the files, relative to their folder.
+        names: of the image files, relative to the folder of the scene.
         depths: (view, 2), the nearest and farthest distance that the files state, or None.
-        notes: what a person should know of the reading, a sentence each: what was left out, turned or scaled.
+        notes: messages for the user about what was left out, rotated or scaled, one sentence each.
         up: as in `Views`.
-        origin: of this world, in that of the files.
+        origin: origin of this world, in the world of the files.
     """
 
     rgba: UInt8[Tensor, "view 4 height width"]
@@ -57,7 +57,7 @@ class Posed:
 
     @cached_property
     def bounds(self) -> Sphere:
-        """The sphere that holds the scene: the stated one, or an estimate from these views."""
+        """The sphere around the scene: the stated one, otherwise an estimate from these views."""
         if self.stated_bounds is not None:
             return self.stated_bounds
         return estimate_bounds(self.cameras, self.rgba[:, 3:] if self.has_alpha else None, self.depths)
@@ -66,12 +66,12 @@ class Posed:
         return len(self.rgba)
 
     def views(self) -> Views:
-        """The float images over white, with masks where the files had alpha."""
+        """The float images over white, with masks if the files have alpha."""
         images, masks = composite_over_white(self.rgba)
         return Views(images, self.cameras, masks if self.has_alpha else None, self.bounds, self.names, self.up)
 
     def select(self, index: list[int]) -> Posed:
-        """The pictures at `index`, in that order; stated bounds stay, others are estimated from these alone."""
+        """The images at `index`, in that order. Bounds that are not stated are estimated from these images alone."""
         return replace(
             self,
             rgba=self.rgba[index],
@@ -81,7 +81,7 @@ class Posed:
         )
 
     def downscaled(self, factor: int | None) -> Posed:
-        """The pictures with the mean of every factor x factor pixels as one pixel; None leaves them as they are."""
+        """The images reduced by averaging blocks of factor x factor pixels; None leaves them as they are."""
         if factor is None or factor == 1:
             return self
         check_downscale(factor, (self.rgba.shape[2], self.rgba.shape[3]), self.names[0])
@@ -97,17 +97,17 @@ class Posed:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the pictures in bytes."""
+        """Memory of the images in bytes."""
         return self.rgba.nbytes
 
 
 @dataclass(frozen=True)
 class PosedTask:
-    """The support and the query pictures of one object.
+    """The support and query images of one object.
 
     Attributes:
-        support: what the method may use.
-        query: what it is judged by, disjoint from the support.
+        support: images that a method is given.
+        query: images that its result is compared with, disjoint from the support.
         name: of the object.
     """
 
@@ -121,17 +121,17 @@ class PosedTask:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the pictures in bytes."""
+        """Memory of the images in bytes."""
         return self.support.nbytes + self.query.nbytes
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a person should know of the reading."""
+        """Messages for the user, as in `Posed`."""
         return self.support.notes
 
     @classmethod
     def split(cls, scene: Posed, support: list[int], query: list[int], name: str) -> PosedTask:
-        """Some views of a scene as support and others as query; bounds are estimated from the support alone."""
+        """Some views of a scene as support and others as query. Estimated bounds depend on the support alone."""
         shown = scene.select(support)
         return cls(shown, replace(scene.select(query), stated_bounds=shown.bounds), name)
 
@@ -143,9 +143,9 @@ class PosedTask:
 
     @classmethod
     def alternating(cls, scene: Posed, name: str) -> PosedTask:
-        """Every other view from the first on as support, the rest as query; a single one is a DataError."""
+        """Every other view, beginning with the first, as support, the rest as query; DataError for a single view."""
         if len(scene) < 2:
-            remedy = "add views; `render --all-views` shows a model what there is"
+            remedy = "add views, or use `render --all-views`, which needs no query views"
             raise DataError(name, "two views or more", f"{len(scene)}", remedy)
         index = list(range(len(scene)))
         return cls.split(scene, index[::2], index[1::2], name)
@@ -167,27 +167,28 @@ def posed(
     depths: Float[Tensor, "view 2"] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Posed:
-    """Put together what a reader found: support and query of a scene in one call, for they share their world.
+    """The scene made of what a reader found.
 
-    Where a scene lies so far from its origin that float32 would lose pixels, as at coordinates of a map, a round vector
-    is subtracted from its cameras and bounds in float64, and stated in the notes.
+    Support and query of a scene are passed in one call, because they share a world. If the scene lies so far from its
+    origin that float32 is not accurate enough, as with map coordinates, a rounded offset is subtracted from its cameras
+    and bounds in float64, and stated in the notes.
 
     Args:
         pictures: (height, width, 4) each, all of one size.
         camera_from_world: (view, 4, 4), OpenCV axes, already checked.
         intrinsics: (view, 3, 3) in pixels, integer pixel centres.
-        has_alpha: whether alpha means anything.
+        has_alpha: whether the alpha channel holds masks.
         bounds: of the scene, or None to estimate them.
-        names: one a picture.
+        names: one per image.
         source: the file, for messages.
-        depths: nearest and farthest distance of what each picture shows, where the files say.
+        depths: nearest and farthest distance of what each image shows, or None.
         notes: as in `Posed`.
 
     Returns:
         The scene.
 
     Raises:
-        DataError: a calibration that is none.
+        DataError: an invalid calibration.
     """
     rgba = torch.from_numpy(np.ascontiguousarray(np.stack(pictures).transpose(0, 3, 1, 2)))
     height, width = rgba.shape[2:]
@@ -199,10 +200,10 @@ def posed(
         if bounds is not None:
             centre = bounds.centre
             bounds = Sphere((centre[0] - x, centre[1] - y, centre[2] - z), bounds.radius)
-        notes = (*notes, f"the world is shifted: ({x:.10g}, {y:.10g}, {z:.10g}) is its new origin, for float32's sake")
+        notes = (*notes, f"the world is shifted for float32 precision: new origin ({x:.10g}, {y:.10g}, {z:.10g})")
     if has_alpha and (wrong := inverted(rgba[:, 3:]).nonzero()[:, 0].tolist()):
-        which = f"the masks of {len(wrong)} of {len(names)} pictures ({listed([names[index] for index in wrong])})"
-        notes = (*notes, f"{which} seem to show the background: invert them, white is the object")
+        which = f"masks of {len(wrong)} of {len(names)} images ({listed([names[index] for index in wrong])})"
+        notes = (*notes, f"{which} seem to show the background; invert them, white is the object")
     try:
         cameras = camera.pinhole(
             torch.from_numpy(intrinsics).float(), torch.from_numpy(camera_from_world).float(), height, width
@@ -213,7 +214,10 @@ def posed(
 
 
 def _far_offset(camera_from_world: npt.NDArray[np.float64], bounds: Sphere | None) -> npt.NDArray[np.float64]:
-    """What to subtract from a world far from its origin: round numbers, so that folders of one world mostly agree."""
+    """The offset to subtract from a world far from its origin, otherwise 0.
+
+    It is rounded, so that most folders of one world get the same offset.
+    """
     rotation, translation = camera_from_world[:, :3, :3], camera_from_world[:, :3, 3:]
     centres = -(rotation.transpose(0, 2, 1) @ translation)[..., 0]
     middle = np.median(centres, axis=0)
@@ -226,18 +230,19 @@ def _far_offset(camera_from_world: npt.NDArray[np.float64], bounds: Sphere | Non
 
 
 def check_pose(matrix: object, source: str | Path, frame: str) -> npt.NDArray[np.float64]:
-    """A rigid (4, 4) transform from what a file holds.
+    """The rigid (4, 4) transform that a file states.
 
     Args:
         matrix: nested lists or an array, (3, 4) or (4, 4).
-        source: the file, for the message.
-        frame: which of its frames, for the message.
+        source: the file, for messages.
+        frame: the frame in the file, for messages.
 
     Returns:
         The transform in float64.
 
     Raises:
-        DataError: another shape, a value that is not finite, or a block that is no rotation.
+        DataError: another shape, a value that is not finite, a 3 x 3 block that is not a rotation, or another last row
+            than 0, 0, 0, 1.
     """
     where = f"{source}, frame {frame}"
     try:

@@ -1,4 +1,4 @@
-"""Take the lens out of a picture: OpenCV's radial and tangential distortion, undone by resampling."""
+"""Undistort images: OpenCV's radial and tangential distortion, removed by resampling."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ __all__ = ["COEFFICIENTS", "check_lens", "distort", "undistort"]
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's names, in OpenCV's order."""
 
-GRID = 41  # places across the picture at which the lens is checked
-MOST_FOLDED = 0.02  # of them; polynomials fitted to the corners often turn just inside them
+GRID = 41  # points per axis at which the lens is checked
+MOST_FOLDED = 0.02  # of them; polynomials fitted to the corners often fold just inside these
 
 Array = npt.NDArray[np.float64]
 
@@ -43,7 +43,7 @@ def distort(points: Array, coefficients: tuple[float, ...]) -> Array:
 
 
 def check_lens(matrix: Array, coefficients: tuple[float, ...], size: tuple[int, ...], source: object) -> None:
-    """Refuse a lens that maps no direction to a part of the picture, or several: it folds.
+    """Raise an error if a lens folds: if it maps no direction, or several, to part of the image.
 
     Args:
         matrix: (3, 3) calibration, integer pixel centres.
@@ -52,22 +52,22 @@ def check_lens(matrix: Array, coefficients: tuple[float, ...], size: tuple[int, 
         source: the file and the frame, for the message.
 
     Raises:
-        DataError: more than 2 % of the picture are beyond the fold.
+        DataError: more than 2 % of the image are beyond the fold.
     """
     folded = _folded(tuple(matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()), tuple(coefficients), tuple(size))
     if folded > MOST_FOLDED:
         stated = ", ".join(f"{n} = {v:g}" for n, v in zip(COEFFICIENTS, coefficients, strict=True) if v)
         raise DataError(
             str(source),
-            "a lens that shows every pixel once",
-            f"{stated}, which folds {folded:.0%} of the picture",
+            "a lens that maps one direction to each pixel",
+            f"{stated}, which folds {folded:.0%} of the image",
             "calibrate again, or undistort the images first",
         )
 
 
-@functools.lru_cache(64)  # frames of one camera have one lens, whatever the file repeats for each
+@functools.lru_cache(64)  # frames of one camera share a lens, although files repeat it
 def _folded(calibration: tuple[float, ...], coefficients: tuple[float, ...], size: tuple[int, ...]) -> float:
-    """The share of the picture that no direction, or several, are mapped to; `calibration` is fx, fy, cx, cy."""
+    """The share of the image to which no direction, or several, are mapped; `calibration` is fx, fy, cx, cy."""
     focal, centre = np.array(calibration[:2]), np.array(calibration[2:])
     rows, columns = (np.linspace(-0.5, extent - 0.5, GRID) for extent in size)
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
@@ -82,16 +82,17 @@ def _folded(calibration: tuple[float, ...], coefficients: tuple[float, ...], siz
 def undistort(
     picture: npt.NDArray[np.uint8], matrix: Array, coefficients: tuple[float, ...], *, opaque: bool = False
 ) -> npt.NDArray[np.uint8]:
-    """The picture that a pinhole with the same calibration would have taken.
+    """The image that a pinhole camera with the same calibration would have taken.
 
     Args:
         picture: (height, width, 4), straight alpha.
         matrix: (3, 3) calibration, integer pixel centres.
         coefficients: of COEFFICIENTS.
-        opaque: the picture has no alpha: repeat its border where the lens did not see, instead of leaving a hole.
+        opaque: for an image without alpha: where the lens did not see, repeat the border of the image instead of making
+            pixels transparent.
 
     Returns:
-        (height, width, 4); bilinear, premultiplied while it is interpolated.
+        (height, width, 4) with straight alpha, interpolated bilinearly with premultiplied alpha.
     """
     height, width = picture.shape[:2]
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
@@ -99,11 +100,11 @@ def undistort(
     ideal = (np.stack([columns, rows], -1).reshape(-1, 2) - centre) / focal
     limit = float(turning_radius(torch.tensor([coefficients], dtype=torch.float64)))
     radius = np.hypot(*ideal.T)
-    beyond = radius >= limit  # no lens shows what the polynomial folds back
+    beyond = radius >= limit  # where the polynomial folds, the lens sees nothing
     ideal[beyond] *= (limit / radius[beyond])[:, None]
     pixels = distort(ideal, coefficients) * focal + centre
     if not opaque:
-        pixels[beyond] = -2.0  # outside of the picture
+        pixels[beyond] = -2.0  # outside the image
     grid = pixels / [max(width - 1, 1) / 2, max(height - 1, 1) / 2] - 1
     straight = torch.from_numpy(picture.astype(np.float32)).permute(2, 0, 1)[None]
     premultiplied = torch.cat([straight[:, :3] * straight[:, 3:] / 255, straight[:, 3:]], 1)

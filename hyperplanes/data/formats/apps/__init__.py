@@ -1,1 +1,1 @@
-"""What capture apps and photogrammetry programs write: cameras in files of their own, beside the photographs."""
+"""Readers of what capture apps and photogrammetry programs export: photographs, with cameras in files beside them."""

@@ -1,4 +1,4 @@
-"""Files of cameras that programs give any name: found by how they begin."""
+"""Find files of cameras by their first bytes, since their names are chosen freely."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ _HEAD = 4096  # bytes
 
 
 def find_by_head(folder: Path, ending: str, accepted: Callable[[str], bool]) -> list[Path]:
-    """The files of a folder with an ending whose first bytes are accepted, sorted by name.
+    """The files of a folder that have a suffix and whose first 4096 bytes are accepted, sorted by name.
 
     Args:
-        folder: to look into, not into the folders in it.
-        ending: of the names, such as ".csv".
-        accepted: whether a file that begins so is one of them; what is no UTF-8 is replaced.
+        folder: to search, without its subfolders.
+        ending: the suffix, such as ".csv".
+        accepted: whether a file that begins with this text is one of them. Bytes that are not UTF-8 are replaced.
     """
     return [path for path in sorted(folder.glob(f"*{ending}")) if path.is_file() and accepted(_head(path))]
 
 
 def _head(path: Path) -> str:
+    """The first bytes of a file as text; empty if it cannot be read."""
     try:
         with open(path, "rb") as file:
             return file.read(_HEAD).decode("utf-8-sig", errors="replace")
@@ -35,15 +36,15 @@ def only_one(found: list[Path], folder: Path, what: str) -> Path:
     """The only file that was found.
 
     Args:
-        found: by `find_by_head`.
-        folder: where.
-        what: they are, for the message.
+        found: the result of `find_by_head`.
+        folder: that was searched, for the message.
+        what: the kind of file, for the message.
 
     Returns:
         Its path.
 
     Raises:
-        DataError: none, or several.
+        DataError: no file or several files were found.
     """
     if len(found) == 1:
         return found[0]

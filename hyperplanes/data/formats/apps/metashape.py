@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 __all__ = ["find_cameras_files", "read_metashape"]
 
 _LARGEST = 256 * 2**20
-_SKEW = 0.5  # pixels that the skew may move a pixel; it is left out
+_SKEW = 0.5  # pixels: the largest displacement by the skew, which is then ignored
 _REMEDY = "export the cameras again"
 
 
 @dataclass(frozen=True)
 class _Sensor:
-    """Size, calibration and lens of the pictures of one camera body."""
+    """Size, calibration and distortion of the images of one camera body."""
 
     size: tuple[int, int]
     calibrate: Callable[[tuple[int, int]], npt.NDArray[np.float64]]
@@ -42,7 +42,7 @@ class _Sensor:
 
 @dataclass(frozen=True)
 class _Similarity:
-    """world = scale * rotation @ point + translation, of the chunk or of one of its components."""
+    """The similarity world = scale * rotation @ point + translation of a chunk or of one of its components."""
 
     rotation: npt.NDArray[np.float64]
     translation: npt.NDArray[np.float64]
@@ -55,20 +55,21 @@ def find_cameras_files(folder: Path) -> list[Path]:
 
 
 def read_metashape(folder: Path, root: Path) -> Listing:
-    """The posed pictures of a file of cameras of Metashape, which lie beside it or in images/.
+    """The posed images of a file of cameras of Metashape, which lie beside it or in images/.
 
-    A camera's `transform` is camera to chunk, by rows, in OpenCV's axes; that of its component, or of the chunk,
-    scales, turns and moves it into the world. Pixels count from the corner of the picture:
-    u = w / 2 + cx + x' (f + b1) + y' b2, v = h / 2 + cy + y' f, where x' and y' have passed Brown's lens with radial k1
-    to k4 and tangential p1 and p2, which are OpenCV's p2 and p1 (Metashape's manual, "Camera models", and
-    process_data/metashape_utils.py of nerfstudio, which keeps neither the component's transform nor that order). Of
-    components that share no world the largest is taken. Masks may lie in masks/.
+    A camera's `transform` is chunk from camera in row-major order, with OpenCV axes. The transform of its component, or
+    else of the chunk, is a similarity from there into the world. Pixel coordinates start at the corner of the image:
+    u = w / 2 + cx + x' (f + b1) + y' b2, v = h / 2 + cy + y' f. Here x' and y' are distorted by Brown's model with
+    radial k1 to k4 and tangential p1 and p2, which are OpenCV's p2 and p1. If cameras belong to several components,
+    those of the largest are taken, since each component has its own world. Masks may lie in masks/. (Metashape's
+    manual, "Camera models", and nerfstudio, process_data/metashape_utils.py, which differs in two ways: it ignores the
+    transforms of components, and keeps p1 and p2 in their order.)
 
     Returns:
-        The pictures in the order of the file; what was left out is in the notes.
+        The images in the order of the file. The notes name cameras that were left out.
 
     Raises:
-        DataError: no cameras that are aligned and calibrated, a fisheye or spherical camera, skew, or broken XML.
+        DataError: no camera that is aligned and calibrated, a fisheye or spherical camera, skew, or malformed XML.
     """
     path = only_one(find_cameras_files(folder), folder, "XML file of cameras of Metashape")
     with malformed(path, "cameras of Metashape"):
@@ -81,7 +82,7 @@ def read_metashape(folder: Path, root: Path) -> Listing:
         if not usable:
             found = f"none of {len(cameras)}"
             raise DataError(path, "cameras that are aligned, enabled and calibrated", found, "align the photographs")
-        # the component with most cameras: others have worlds of their own
+        # the component with most cameras: each component has its own world
         largest = Counter(each.get("component_id") for each in usable).most_common(1)[0][0]
         kept = [each for each in usable if each.get("component_id") == largest]
         world = worlds.get(largest) or _similarity(chunk, path)
@@ -101,7 +102,7 @@ def read_metashape(folder: Path, root: Path) -> Listing:
 
 
 def _chunk(path: Path, root: Path) -> Element:
-    """The chunk with the cameras."""
+    """The chunk with most cameras."""
     from xml.etree import ElementTree
 
     data = read_bytes(path, _LARGEST, root)
@@ -122,7 +123,7 @@ def _is_aligned(camera: Element) -> bool:
 
 
 def _sensor(element: Element, path: Path) -> _Sensor | None:
-    """The calibration of a sensor, None where it has none: the adjusted one where there are several."""
+    """The calibration of a sensor, the adjusted one if there are several; None if there is none."""
     found = {each.get("class", ""): each for each in element.iterfind("calibration")}
     if not found:
         return None
@@ -150,12 +151,12 @@ def _sensor(element: Element, path: Path) -> _Sensor | None:
         )
     radial = [value.get(f"k{index}", 0.0) for index in range(1, 5)]
     reach = math.hypot(width, height) / 2 / min(focal)
-    tangential = value.get("p2", 0.0), value.get("p1", 0.0)  # OpenCV's p1 and p2: Metashape's, the other way round
+    tangential = value.get("p2", 0.0), value.get("p1", 0.0)  # OpenCV's p1 and p2 are Metashape's p2 and p1
     return _Sensor((height, width), calibrate, brown_lens(radial, tangential, reach, where))
 
 
 def _similarity(element: Element, path: Path) -> _Similarity:
-    """The transform of a chunk or of a component; without one their world is that of the cameras."""
+    """The transform of a chunk or of a component; the identity if it has none."""
     transform = element.find("transform")
     if transform is None or transform.find("rotation") is None:
         return _Similarity(np.eye(3), np.zeros(3), 1.0)
@@ -170,7 +171,7 @@ def _similarity(element: Element, path: Path) -> _Similarity:
 
 
 def _pose(camera: Element, world: _Similarity, path: Path) -> npt.NDArray[np.float64]:
-    """camera_from_world, OpenCV axes; the camera's own units are those of the world."""
+    """camera_from_world, OpenCV axes, as a rigid transform: only the centre is scaled."""
     chunk_from_camera = check_pose(_numbers(camera, "transform", 16).reshape(4, 4), path, camera.get("label", ""))
     rotation = world.rotation @ chunk_from_camera[:3, :3]
     centre = world.scale * world.rotation @ chunk_from_camera[:3, 3] + world.translation
@@ -180,7 +181,7 @@ def _pose(camera: Element, world: _Similarity, path: Path) -> npt.NDArray[np.flo
 
 
 def _numbers(element: Element, name: str, count: int) -> npt.NDArray[np.float64]:
-    """The numbers in a child of an element."""
+    """The numbers in the text of a child of an element; raises ValueError if they are not `count`."""
     words = (element.findtext(name) or "").split()
     if len(words) != count:
         raise ValueError(f"{name} with {len(words)} numbers instead of {count}")

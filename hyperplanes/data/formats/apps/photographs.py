@@ -1,4 +1,4 @@
-"""Where the photographs lie that a program names in its file of cameras, as it found them on another machine."""
+"""Find the photographs that a program names in its file of cameras, often by their paths on another machine."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ def find_photographs(
 ) -> tuple[list[Path], list[Path | None]]:
     """The files of photographs, and their masks.
 
-    Of each name only the last part counts, its ending only where there is one; of images/, input/, photos/, rgb/ and
-    the folder itself that which holds most of them is taken. Masks lie in masks/ in the folder.
+    Only the file name in each path is used. It may lack the suffix. The photographs are taken from the one of images/,
+    input/, photos/, rgb/ and the folder itself that holds most of them. Masks lie in masks/ in the folder.
 
     Args:
-        folder: what holds the file of cameras.
-        names: as that file writes them: paths of any system, file names, or file names without ending.
+        folder: that holds the file of cameras.
+        names: as that file writes them: paths of any operating system, file names, or file names without a suffix.
         source: that file, for messages.
-        root: no file may lie outside of it, symbolic links followed.
+        root: no file may lie outside it, symbolic links followed.
 
     Returns:
-        A path a name, of a file that need not be there, and a mask or None each.
+        For each name a path, at which a file need not exist; and for each a mask or None.
 
     Raises:
-        DataError: a name that no file can have, two names of one photograph, two photographs of one name without
-            ending, or none of the photographs.
+        DataError: an impossible file name, two names for one photograph, a name without suffix that fits two
+            photographs, or none of the photographs.
     """
     plain = [PurePosixPath(name.replace("\\", "/")).name for name in names]
     listed = {home: list_files(folder / home, PICTURE_SUFFIXES, root) for home in _HOMES if (folder / home).is_dir()}
@@ -45,7 +45,7 @@ def find_photographs(
     home = max(known, key=lambda each: sum(name.lower() in known[each] for name in plain))
     stems = Counter(path.stem.lower() for path in listed[home])
     if several := [name for name in plain if stems[name.lower()] > 1]:
-        remedy = "move those away that the cameras are not of"
+        remedy = "remove those that the cameras do not belong to"
         raise DataError(source, f"one photograph {several[0]}", "several, with different endings", remedy)
     paths = [known[home].get(name.lower()) or inside(folder / home, name, source) for name in plain]
     if not any(path.is_file() for path in paths):

@@ -1,4 +1,4 @@
-"""Polycam's raw data: a JSON file of camera beside each photograph, in the world of ARKit."""
+"""Polycam's raw data: a JSON file with the camera of each photograph, in the world of ARKit."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _STATED = "a camera of Polycam: t_00 to t_23, fx, fy, cx, cy, width, height"
 
 
 def is_polycam(folder: Path) -> bool:
-    """Whether a folder holds a capture as Polycam exports its raw data, or is the keyframes of one."""
+    """Whether a folder holds the raw data of a Polycam capture, or is its folder keyframes."""
     return _places(folder) is not None
 
 
 def _places(folder: Path) -> tuple[Path, Path] | None:
-    """The folders of cameras and of photographs: those that Polycam corrected, where it did."""
+    """The folders of cameras and of photographs, preferably the corrected ones; None if there are none."""
     for base in (folder / "keyframes", folder):
         for kind in ("corrected_", ""):
             cameras, pictures = base / f"{kind}cameras", base / f"{kind}images"
@@ -35,18 +35,19 @@ def _places(folder: Path) -> tuple[Path, Path] | None:
 
 
 def read_polycam(folder: Path, root: Path) -> Listing:
-    """The posed pictures of a capture of Polycam, unzipped.
+    """The posed images of an unzipped Polycam capture.
 
-    keyframes/corrected_cameras/N.json and corrected_images/N.jpg, which are there once the app has processed the
-    capture, otherwise cameras and images. t_ij is row i, column j of the pose, camera to world in OpenGL's axes; the
-    world is ARKit's, y up. Principal points count from the corner of the picture, as in ARKit. Masks may lie in masks/
-    beside the photographs' folder, or beside keyframes/. (Layout: nerfstudio, process_data/polycam_utils.py.)
+    The files are keyframes/corrected_cameras/N.json and corrected_images/N.jpg, which exist once the app has processed
+    the capture, otherwise those in cameras and images. t_ij is row i, column j of the pose, which is camera-to-world
+    with OpenGL axes. The world is ARKit's, y up. Principal points are at half-pixel centres, as in ARKit. Masks may lie
+    in masks/ beside the folder of photographs, or beside keyframes/. (Layout: nerfstudio,
+    process_data/polycam_utils.py.)
 
     Returns:
-        The pictures in the order of their names.
+        The images in the order of their names.
 
     Raises:
-        DataError: anything wrong with a file.
+        DataError: a file is missing or malformed.
     """
     found = _places(folder)
     if found is None:

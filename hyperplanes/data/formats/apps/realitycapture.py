@@ -21,7 +21,7 @@ from hyperplanes.utilities.files import DataError, malformed, read_text
 __all__ = ["find_tables", "read_realitycapture", "world_from_angles"]
 
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
-_FILM = 36.0  # millimetres: what the longer side of every picture counts as
+_FILM = 36.0  # millimetres: the sensor size that f assumes along the longer side of the image
 _LARGEST = 64 * 2**20
 _REMEDY = "export Internal/External camera parameters again"
 
@@ -32,7 +32,7 @@ def find_tables(folder: Path) -> list[Path]:
 
 
 def _header(lines: list[str]) -> int | None:
-    """The number of the line that names the columns: the first, or the second after "#cameras N"."""
+    """The index of the line that names the columns, which "#cameras N" may precede; None if there is none."""
     for number, line in enumerate(lines[:2]):
         if set(_NEEDED) <= set(_columns(line)):
             return number
@@ -40,21 +40,23 @@ def _header(lines: list[str]) -> int | None:
 
 
 def _columns(line: str) -> list[str]:
+    """The names of the columns in lower case."""
     return [name.strip().lower() for name in line.lstrip("#").split(",")]
 
 
 def read_realitycapture(folder: Path, root: Path) -> Listing:
-    """The posed pictures of a table of cameras of RealityCapture, which lie beside it or in images/.
+    """The posed images of a table of cameras of RealityCapture, which lie beside it or in images/.
 
-    Position x, y, alt; angles as `world_from_angles`. f is the focal length in millimetres where the longer side of the
-    picture counts 36, px and py are the offset of the principal point from the middle, in longer sides of the picture
-    (y down), as PrincipalPointU and V of its XMP files. k1 to k4 are Brown's radial, t1 and t2 OpenCV's tangential
-    coefficients. Columns may stand in any order; those of the lens and the principal point may be missing. Masks may
-    lie in masks/. (Columns and angles: nerfstudio, process_data/realitycapture_utils.py, which guesses another unit of
-    px and py; that unit and the lens: "RealityCapture XMP Camera Math", support.capturingreality.com.)
+    The position is x, y, alt; for the angles see `world_from_angles`. f is the focal length in millimetres on a sensor
+    of 36 mm along the longer side of the image. px and py are the offset of the principal point from the middle, in
+    units of the longer side (y down), like PrincipalPointU and V of XMP files. k1 to k4 are Brown's radial
+    coefficients, t1 and t2 OpenCV's tangential ones. Columns may have any order. Those of the distortion and the
+    principal point may be missing. Masks may lie in masks/. (Columns and angles: nerfstudio,
+    process_data/realitycapture_utils.py, which guesses another unit of px and py. That unit and the distortion:
+    "RealityCapture XMP Camera Math", support.capturingreality.com.)
 
     Returns:
-        The pictures in the order of the table. Anything wrong with a file is a DataError.
+        The images in the order of the table. Raises DataError if a file is missing or malformed.
     """
     path = only_one(find_tables(folder), folder, "table of cameras of RealityCapture")
     names, cameras = _rows(path, root)
@@ -68,7 +70,7 @@ def read_realitycapture(folder: Path, root: Path) -> Listing:
             pose[:3, 3] = camera["x"], camera["y"], camera["alt"]
             focal = camera["f"] / _FILM
             centre = camera.get("px", 0.0), camera.get("py", 0.0)
-            calibration_matrix((focal, focal), centre, where)  # refused here, before any picture is read
+            calibration_matrix((focal, focal), centre, where)  # raises an error before any image is read
             radial, tangential = (
                 [camera.get(f"{kind}{i}", 0.0) for i in range(1, n)] for kind, n in (("k", 5), ("t", 3))
             )
@@ -80,10 +82,10 @@ def read_realitycapture(folder: Path, root: Path) -> Listing:
 
 
 def world_from_angles(heading: float, pitch: float, roll: float) -> npt.NDArray[np.float64]:
-    """The (3, 3) rotation of a camera in OpenGL's axes, from RealityCapture's angles in degrees.
+    """The (3, 3) rotation of a camera with OpenGL axes, from RealityCapture's angles in degrees.
 
-    With all three zero the camera looks straight down, the upper border of its picture towards y, in a world with z up;
-    heading turns clockwise seen from above.
+    If all three are zero, the camera looks straight down in a world with z up, and the top of its image points towards
+    y. The heading is clockwise, seen from above.
 
     >>> (world_from_angles(90, 0, 0).round() + 0.0).tolist()
     [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
@@ -94,7 +96,7 @@ def world_from_angles(heading: float, pitch: float, roll: float) -> npt.NDArray[
 
 
 def _calibration(focal: float, centre: tuple[float, float], size: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """The calibration of a picture of (height, width); focal length and offset in its longer side."""
+    """The calibration of an image of (height, width), from focal length and offset in units of its longer side."""
     longer = max(size)
     middle = size[1] / 2 + centre[0] * longer, size[0] / 2 + centre[1] * longer
     return calibration_matrix((focal * longer, focal * longer), middle, "")
@@ -122,7 +124,7 @@ def _rows(path: Path, root: Path) -> tuple[list[str], list[dict[str, float]]]:
 
 
 def _numbers(row: dict[str, str], where: str) -> dict[str, float]:
-    """The numbers of a line; a column of another kind, which a template may add, is left out unless it is needed."""
+    """The numbers of a line. Columns of text, which an export template may add, are left out unless they are needed."""
     numbers = {}
     for name, text in row.items():
         try:

@@ -18,34 +18,34 @@ from hyperplanes.utilities.files import DataError, check_link, malformed, read_j
 __all__ = ["is_record3d", "read_record3d"]
 
 _PLACES = (("metadata", "rgbd"), ("metadata.json", "rgb"), ("metadata.json", "rgbd"))
-_UNIT = 1e-2  # by which the length of a quaternion may differ from 1
+_UNIT = 1e-2  # largest difference of the length of a quaternion from 1
 
 
 def is_record3d(folder: Path) -> bool:
-    """Whether a folder holds a video as Record3D exports it: an unzipped .r3d, or EXR and JPG."""
+    """Whether a folder holds an export of Record3D: an unzipped .r3d file, or EXR and JPG files."""
     return _places(folder) is not None
 
 
 def _places(folder: Path) -> tuple[Path, Path] | None:
-    """The file of poses and the folder of photographs."""
+    """The file of poses and the folder of photographs; None if they do not exist."""
     pairs = ((folder / file, folder / home) for file, home in _PLACES)
     return next(((file, home) for file, home in pairs if file.is_file() and home.is_dir()), None)
 
 
 def read_record3d(folder: Path, root: Path) -> Listing:
-    """The posed pictures of a video of Record3D.
+    """The posed images of a video of Record3D.
 
-    Pose i belongs to rgbd/i.jpg (of an unzipped .r3d, beside `metadata`) or rgb/i.jpg (of an export as EXR and JPG,
-    beside `metadata.json`): a quaternion x, y, z, w and a position, camera to world in OpenGL's axes. The world has the
-    first camera's axes, so nothing says which way is up. The calibration is K, by columns, or that of each frame in
-    `perFrameIntrinsicCoeffs` (fx, fy, cx, cy). Masks may lie in masks/. (Layout: its author in the issues 27, 33 and 83
-    of marek-simonik/record3d; instant-ngp, scripts/record3d2nerf.py.)
+    Pose i belongs to rgbd/i.jpg (in an unzipped .r3d, beside `metadata`) or rgb/i.jpg (in an export as EXR and JPG,
+    beside `metadata.json`). It is a quaternion x, y, z, w and a position, camera-to-world with OpenGL axes. The world
+    has the axes of the first camera, so its up direction is unknown. The calibration is K in column-major order, or
+    (fx, fy, cx, cy) of each frame in `perFrameIntrinsicCoeffs`. Masks may lie in masks/. (Layout: its author in the
+    issues 27, 33 and 83 of marek-simonik/record3d; instant-ngp, scripts/record3d2nerf.py.)
 
     Returns:
-        The pictures in the order of their numbers.
+        The images in the order of their numbers.
 
     Raises:
-        DataError: anything wrong with a file.
+        DataError: a file is missing or malformed.
     """
     found = _places(folder)
     if found is None:
@@ -84,7 +84,7 @@ def _intrinsics(document: dict[str, Any], count: int) -> npt.NDArray[np.float64]
 
 
 def _pose(row: npt.NDArray[np.float64], path: Path, index: int) -> npt.NDArray[np.float64]:
-    """The (4, 4) pose of a quaternion x, y, z, w and a position."""
+    """The (4, 4) pose from a quaternion x, y, z, w and a position."""
     from scipy.spatial.transform import Rotation
 
     length = float(np.linalg.norm(row[:4]))
