@@ -156,9 +156,9 @@ def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
     work.notes += notes
     if len(photographs) < FEWEST:
         found = f"{len(photographs)} of {len(paths)}"
-        raise DataError(
-            source, f"at least {FEWEST} different photographs that can be read", found, "; ".join(notes)[:200]
-        )
+        found += f" ({'; '.join(notes)})" if notes else ""
+        wanted = f"at least {FEWEST} different photographs that can be read"
+        raise DataError(source, wanted, found, "add photographs from other viewpoints")
     return photographs, is_video
 
 

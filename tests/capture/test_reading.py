@@ -186,6 +186,7 @@ def test_copies_of_a_file_are_left_out(upright, tmp_path):
     [
         ("netwrok", "expected one of auto, given"),
         ("cut {image}", "{mask} in it"),
+        ("rembg 'i {image} {mask}", "expected a command, got .* .No closing quotation.; correct it"),
         ("no_such_program {image} {mask}", "a program that is installed, found none called 'no_such_program'"),
         ("network", "onnx"),
         ("grabcut", "package cv2"),

@@ -121,7 +121,7 @@ def test_reprojection_errors_of_colmap(tmp_path, binary):
         (tmp_path / "points3D.txt").write_text("# points\n" + "\n".join(lines) + "\n")
     found = read_sparse_points(tmp_path)
     assert found.errors == {"a.png": 1.5, "b.png": 3.0}
-    assert (found.count, found.error) == (3, pytest.approx(2.4))
+    assert (len(found.places), found.error) == (3, pytest.approx(2.4))
     np.testing.assert_array_equal(found.places[1], [3, 4, 5])
     views = replace(standing((0, 0), (20, 0)), names=("a.png", "b.png"))
     said = "\n".join(describe_scene(views, replace(found, errors={"a.png": 1.0, "b.png": 4.0})).lines())

@@ -29,7 +29,7 @@ class Command:
         line: the command, with {image} and {mask} for the paths of the two files. It is run without a shell.
 
     Raises:
-        ValueError: {image} or {mask} is missing, or the program is not installed.
+        ValueError: {image} or {mask} is missing, a quotation is not closed, or the program is not installed.
     """
 
     line: str
@@ -40,7 +40,10 @@ class Command:
                 f"--mask: expected a command with {{image}} and {{mask}} in it, got {self.line!r}; "
                 'such as --mask "rembg i {image} {mask}"'
             )
-        program = shlex.split(self.line)[0]
+        try:
+            program = shlex.split(self.line)[0]
+        except ValueError as error:  # an unbalanced quotation mark
+            raise ValueError(f"--mask: expected a command, got {self.line!r} ({error}); correct it") from None
         if shutil.which(program) is None:
             raise ValueError(f"--mask: expected a program that is installed, found none called {program!r}")
 

@@ -23,13 +23,11 @@ class SparsePoints:
 
     Attributes:
         places: positions (point, 3) in the world of the cameras.
-        count: number of points.
         error: reprojection error in pixels, the mean over all observations of points; None if it is unknown.
         errors: mean reprojection error of the points that an image shows, by the name of the image; empty if unknown.
     """
 
     places: npt.NDArray[np.float64]
-    count: int
     error: float | None = None
     errors: Mapping[str, float] = field(default_factory=dict)
 
@@ -64,7 +62,7 @@ def _of_ply(path: Path, root: Path) -> SparsePoints:
     with malformed(path, "a PLY file of points"), open(path, "rb") as file:
         loaded = trimesh.load(file, "ply", process=False)
         places = np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))), np.float64).reshape(-1, 3)
-    return SparsePoints(places, len(places))
+    return SparsePoints(places)
 
 
 def _of_colmap(model: Path, path: Path, root: Path) -> SparsePoints:
@@ -78,7 +76,7 @@ def _of_colmap(model: Path, path: Path, root: Path) -> SparsePoints:
         places = np.array([place for place, _, _ in points], np.float64).reshape(-1, 3)
         every = [error for values in sums.values() for error in values]
         errors = {name: float(np.mean(values)) for name, values in sums.items()}
-    return SparsePoints(places, len(points), float(np.mean(every)) if every else None, errors)
+    return SparsePoints(places, float(np.mean(every)) if every else None, errors)
 
 
 Point = tuple[tuple[float, ...], float, set[int]]

@@ -20,7 +20,7 @@ from hyperplanes.utilities.files import DataError
 __all__ = ["calibration", "number", "opencv_from_opengl", "stated_size", "transforms_document"]
 
 _NOT_PERSPECTIVE = ("is_fisheye", "ortho")  # fields by which instant-ngp marks cameras that are not perspective
-_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL"}
+_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL"}
 
 
 def transforms_document(
@@ -102,7 +102,7 @@ def calibration(
     """
     height, width = size
     model = fields.get("camera_model", "OPENCV")
-    if model not in _PERSPECTIVE and model != "FULL_OPENCV":
+    if model not in _PERSPECTIVE:
         raise DataError(str(source), "a perspective camera_model", repr(model), "undistort the images first")
     for name in _NOT_PERSPECTIVE:
         if fields.get(name):

@@ -310,8 +310,8 @@ def _sharpness(views: Views, apart: Tensor) -> Float[Tensor, " view"]:
 def _sparse_line(sparse: SparsePoints) -> str:
     """One line about the points of a reconstruction."""
     if sparse.error is None:
-        return f"points: {sparse.count:,} of a sparse reconstruction"
-    line = f"reprojection error: {sparse.error:.2f} pixels (mean, {sparse.count:,} points)"
+        return f"points: {len(sparse.places):,} of a sparse reconstruction"
+    line = f"reprojection error: {sparse.error:.2f} pixels (mean, {len(sparse.places):,} points)"
     if not sparse.errors or not math.isfinite(sparse.error):
         return line
     worst = max(sparse.errors, key=lambda name: sparse.errors[name])
