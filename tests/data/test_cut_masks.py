@@ -75,6 +75,10 @@ def test_scenes_are_read_with_a_note_about_them(has_alpha):
     options = {"has_alpha": has_alpha, "bounds": None, "names": ("a", "b", "c"), "source": "scene"}
     found = posed([picture] * 3, poses.numpy(), calibrations.numpy(), **options)
     assert any("invert them, white is the object" in note for note in found.notes) == has_alpha
+    assert not any("principal point" in note for note in found.notes)
+    calibrations[1, 0, 2] = 5000.0
+    found = posed([picture] * 3, poses.numpy(), calibrations.numpy(), **options)
+    assert any("the principal point lies outside the image: b; check cx and cy" in note for note in found.notes)
 
 
 def test_right_poses_of_close_ups_are_not_called_wrong(close_ups):
