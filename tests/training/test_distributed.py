@@ -81,7 +81,7 @@ def test_a_stop_that_one_process_is_asked_for_ends_both_after_the_same_step(join
     folder, _ = joined
     first, second = (read_json(folder / f"told-{rank}.json") for rank in range(2))
     assert first["step"] == second["step"] == 2
-    assert first["stopped"] == "KeyboardInterrupt: step 2 is saved, the same command goes on from there"
+    assert first["stopped"] == "KeyboardInterrupt: step 2 is saved; run the same command again to resume from there"
     assert second["stopped"] == "none"
     assert read_json(folder / "stopped" / "training.json")["step"] == 2
 
