@@ -77,7 +77,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         with interruptible():
             return _run(verb, module, rest)
     except KeyboardInterrupt as interrupt:
-        advice = str(interrupt) or "run the same command again; it resumes if it can"
+        advice = str(interrupt) or "the same command resumes where possible"
         code = interrupt.code if isinstance(interrupt, Terminated) else 130
         with suppress(OSError):  # the terminal may be closed
             _print_error(f"hyperplanes {verb}: {'interrupted' if code == 130 else 'terminated'}; {advice}")

@@ -960,9 +960,9 @@ def test_a_single_scene_is_evaluated_with_the_way_up_that_its_cameras_tell(tmp_p
 
     capsys.readouterr()
     expected = quality(scene)
-    assert "up: y, from how the cameras are held; --up overrides it" in capsys.readouterr().out
+    assert "up: y, guessed from how the cameras are held; --up overrides it" in capsys.readouterr().out
     assert quality(turned) == pytest.approx(expected, abs=1e-2)
-    assert "up: z, from how the cameras are held; --up overrides it" in capsys.readouterr().out
+    assert "up: z, guessed from how the cameras are held; --up overrides it" in capsys.readouterr().out
     assert quality(turned, "--up", "0,0,2") == pytest.approx(expected, abs=1e-2)
     assert quality(turned, "--up", "-z") == quality(turned, "--up=-z") < expected - 0.1
     assert abs(quality(turned, "--up", "y") - expected) > 0.1
@@ -982,7 +982,7 @@ def test_photographs_with_a_background_are_warned_about_and_ways_up_are_said(tmp
     command = ["render", "--checkpoint", str(demo_folder()), "--views", str(scene), "--out", str(tmp_path / "out")]
     assert main(command) == 0
     shown = capsys.readouterr()
-    assert "up: y, from how the cameras are held; --up overrides it" in shown.out
+    assert "up: y, guessed from how the cameras are held; --up overrides it" in shown.out
     assert "rendering 6/6" in shown.out
     assert "the views have no alpha and no masks" in shown.err
     assert re.search("worse than copying the nearest view: .*; cut the object out first", shown.err)
