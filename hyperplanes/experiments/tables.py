@@ -1,4 +1,4 @@
-"""The ten experiments of the paper as data: what is trained, what is evaluated, and where it stands in the paper."""
+"""The ten experiments of the paper as data: their trainings, their evaluations, and their places in the paper."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hyperplanes.utilities.errors import did_you_mean
 __all__ = ["CLASSES", "EXPERIMENTS", "find_experiment", "find_experiments"]
 
 CLASSES = {"Cars": "car", "Chairs": "chair", "Planes": "plane", "Lamps": "lamp"}
-"""The paper's headings and the names of the classes of `generate`."""
+"""The names of the classes of `generate` by the paper's headings."""
 
 EPOCHS_128 = {"car": 1000, "lamp": 1100, "chair": 700}
 EPOCHS_200 = {"car": 2420, "plane": 2460, "chair": 1920}
@@ -24,17 +24,17 @@ LEARNED = {
     "MV Meta": ("mv_meta", "mv_meta"),
     "SV Meta": ("sv_meta", "sv_meta"),
 }
-"""Methods of Tancik et al. and the training that each needs; of "standard" only the shape is read."""
+"""Methods of Tancik et al., each with the training that it needs. "standard" only needs its architecture."""
 SHOWN = (1, 3, 5, 25)
-"""Support views of the table of learned initialisations: the paper does not say how many those were given."""
+"""Numbers of support views in the table of learned initialisations; the paper does not state how many these had."""
 TARGETS = {"NeRF": "nerf", "MultiPlaneNeRF": "multiplane", "PointMultiPlaneNeRF": "point_multiplane"}
 TUNED = {"HyperPlanes-0": "hyperplanes", "HyperPlanes-10": "hyperplanes_10", "HyperPlanes-100": "hyperplanes_100"}
 WHOLE = "HyperPlanes-100, all weights"
-"""100 steps on theta + delta as `render --steps 100` takes them, at `small` with fewer rays; not in the paper."""
+"""100 steps on theta + delta as in `render --steps 100`, with fewer rays at the scale `small`; not in the paper."""
 
 
 ALL_READ: Mapping[str, object] = {"model.hypernetwork.views": 25}
-"""25 HyperPlanes, as the paper has them at 200x200 (tab:cross)."""
+"""25 HyperPlanes, as in the paper at 200x200 (tab:cross)."""
 
 
 def _hyperplanes(on: str, changes: Mapping[str, object] | None = None, planes: int = ALL_PLANES) -> Trained:
@@ -93,7 +93,7 @@ def _cross_class() -> Experiment:
         on = _hyperplanes(CLASSES[source], ALL_READ)
         for target in names:
             row = f"{source} on {target}"
-            for column in ("MultiPlaneNeRF", "PointMultiPlaneNeRF"):  # the latter: the field of HyperPlanes alone
+            for column in ("MultiPlaneNeRF", "PointMultiPlaneNeRF"):  # the latter is the field of HyperPlanes alone
                 plain = Trained(CLASSES[source], TARGETS[column])
                 cells.append(Cell(row, column, plain, TARGETS[column], CLASSES[target]))
             cells += _tuned(row, on, CLASSES[target])
@@ -326,19 +326,19 @@ EXPERIMENTS: dict[str, Experiment] = {
         _layers(),
     )
 }
-"""By the names that `hyperplanes reproduce` takes."""
+"""The experiments by the names that `hyperplanes reproduce` takes."""
 
 
 def find_experiments() -> dict[str, Experiment]:
-    """The tables of the paper, then those that entry points of the group `hyperplanes.tables` name."""
+    """The tables of the paper, then those of other packages (entry points of the group `hyperplanes.tables`)."""
     return EXPERIMENTS | load_entries("hyperplanes.tables", EXPERIMENTS)
 
 
 def find_experiment(name: str) -> Experiment:
-    """One table.
+    """One table or figure.
 
     Args:
-        name: of `find_experiments`.
+        name: a name in `find_experiments()`.
 
     Raises:
         ValueError: an unknown name.
