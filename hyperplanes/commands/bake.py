@@ -106,7 +106,7 @@ def run(arguments: Arguments) -> int:
         each.render(first)  # compile kernels and find the occupied voxels before time is measured
     slow, before = _timed(lambda: field.render(query.cameras).images.clamp(0, 1).cpu())
     fast, after = _timed(lambda: scene.render(query.cameras).images.clamp(0, 1))
-    kind = "shown" if arguments.all_views else "query"
+    kind = "support" if arguments.all_views else "query"
     console.say(
         f"{len(query)} {kind} views: {format_duration(fast / len(query))} each, "
         f"{slow / fast:.0f} times the field's speed; "

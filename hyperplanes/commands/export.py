@@ -192,8 +192,8 @@ def _refuse_unused(arguments: Arguments) -> None:
 
 
 def _compared_with(arguments: Arguments) -> str:
-    """The kind of views that the outputs are compared with: "shown" if the field was adapted to them, or "query"."""
-    return "shown" if arguments.all_views else "query"
+    """The kind of views that the outputs are compared with: "support" with `--all-views`, otherwise "query"."""
+    return "support" if arguments.all_views else "query"
 
 
 def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:

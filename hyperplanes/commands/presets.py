@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HEADINGS", "Arguments", "row", "run"]
 
-HEADINGS = ("preset", "pixels", "network", "encoder", "shown", "sampling", "steps", "rays a step")
+HEADINGS = ("preset", "pixels", "network", "encoder", "views read", "sampling", "steps", "rays a step")
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ def run(arguments: Arguments) -> int:
     corrected = isinstance(residuals, ResidualField)
     if corrected:
         with console.bar("residuals") as bar:
-            residuals.prepare(lambda done: bar.show(done, len(shown), "shown views"))
+            residuals.prepare(lambda done: bar.show(done, len(shown), "support views"))
     started = time.perf_counter()
     pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / asked.cameras.batch_size

@@ -115,7 +115,7 @@ SINGLE = PublishedTable(
 
 @dataclass(frozen=True)
 class Fact:
-    """What a source states about a setting.
+    """The statement of a source about a setting.
 
     Attributes:
         entry: the dotted name of the setting in this project, such as "model.network.depth". Names that begin with

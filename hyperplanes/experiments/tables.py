@@ -73,7 +73,7 @@ def _shapenet() -> Experiment:
         (
             "The paper gives HyperPlanes 25 support views and does not say how many the methods of Tancik et al. were "
             "given for their 2,000 steps. Their published notebook (tancik/learnit, Experiments/shapenet.ipynb, "
-            "test_time_views = 1) judges every training by one, so the paper's numbers stand beside 1 view, as a "
+            "test_time_views = 1) evaluates every training with one, so the paper's numbers are beside 1 view, as a "
             "guess.",
             "small: the packaged model of any number of views, trained by this project on four procedural classes at "
             "128x128; not in the paper.",
@@ -111,7 +111,7 @@ def _cross_class() -> Experiment:
             "The paper's MultiPlaneNeRF has 24.91 dB for cars and 24.27 for planes here, and 24.79 and 24.26 in "
             "tab:single_inference.",
             "PointMultiPlaneNeRF: the field of HyperPlanes as one set of weights for all objects, not in the paper. "
-            "MultiPlaneNeRF and HyperPlanes differ in the field and in the hypernetwork; this column tells them apart.",
+            "MultiPlaneNeRF and HyperPlanes differ in the field and in the hypernetwork; this column separates both.",
             f"{WHOLE}: not in the paper.",
         ),
     )
@@ -208,7 +208,7 @@ def _iterations() -> Experiment:
         (
             "The paper has a picture and says: NeRF needs approximately 36000 epochs (63.7 minutes) to reach what one "
             "step of HyperPlanes does in 10 seconds, a speedup of 380, on two objects.",
-            "NeRF is optimised on the same support views and judged on the same query views as HyperPlanes.",
+            "NeRF is optimised on the same support views and evaluated on the same query views as HyperPlanes.",
         ),
         1,
     )
@@ -254,7 +254,7 @@ def _number_of_imageplanes() -> Experiment:
         (
             "The paper has a picture and says that 25 are best. One caption says ShapeNet 128x128, the other 200x200.",
             "Above 25 the planes are the support views and the first query views, as support and query are one set in "
-            "the paper: some views that a row is judged by are then among its planes.",
+            "the paper: some of the evaluated views are then among the planes.",
         ),
     )
 

@@ -99,7 +99,7 @@ class Processes:
         'def'
 
         Args:
-            values: as many values as a multiple of the number of processes.
+            values: a sequence whose length is a multiple of the number of processes.
         """
         size = len(values) // self.count
         return values[self.rank * size : (self.rank + 1) * size]

@@ -47,7 +47,7 @@ HERO_SCALE, SCALE = 2.5, 1.5
 
 GAP = 6
 
-TITLE = "New views of objects it has never seen"
+TITLE = "New views of held-out objects"
 
 
 def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores: Mapping[str, Score]) -> None:
