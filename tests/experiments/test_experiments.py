@@ -272,7 +272,7 @@ def test_of_how_many_objects_and_runs_the_paper_speaks():
     """Source of truth: its words; "two objects from the car and chair classes", and "averaged over 3 runs"."""
     names = "iterations", "target"
     found = {name: report.what_differs(outcome_of(EXPERIMENTS[name], 3, objects={})) for name in names}
-    judged = {name: [line for line in lines if line.startswith("Judged by")] for name, lines in found.items()}
+    judged = {name: [line for line in lines if line.startswith("Evaluated on")] for name, lines in found.items()}
     assert judged == {"iterations": [], "target": ["Evaluated on 2 objects a class. Paper: all test objects."]}
     assert [line.rpartition(". ")[2] for line in found["iterations"] if line.startswith("Seeds")] == ["Paper: 3."]
 
