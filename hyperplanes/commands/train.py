@@ -2,15 +2,15 @@
 
 The model is evaluated on held-out objects at intervals. Checkpoints are written to --out during the training; to resume
 an interrupted training from the last one, run the same command again. Ctrl-C stops after a checkpoint is written, as
-does the SIGTERM of a cluster; a second Ctrl-C stops immediately. Beside the weights, --out has config.yaml, which
---config takes, curve.csv, samples/ with held-out views beside the true images, and best/ with the model that had the
+does the SIGTERM of a cluster; a second Ctrl-C stops immediately. Beside the weights, --out has config.yaml (for the
+option --config), curve.csv, samples/ with held-out views beside the true images, and best/ with the model that had the
 highest PSNR on held-out objects.
 
 With --devices N, N processes on this machine share the objects of every step, one per GPU; with --nodes M, N processes
 on each of M machines do. If torchrun starts this command, its processes are used.
 
-Every setting of the model and of the training is an option too, such as --model.hypernetwork.views 3 or
---training.learning-rate 1e-3. `hyperplanes presets quick` prints all of them with their values, as a file for --config.
+Every setting of the model and of the training is an option too, such as --training.learning-rate 1e-3. To see all of
+them with their values, as a file for --config, run `hyperplanes presets quick`.
 
 Example:
     hyperplanes train --data data/cars --preset quick --out runs/cars

@@ -1,8 +1,8 @@
 """Show an object in the browser: it can be turned, and the photographs are at the poses where they were taken.
 
 A model adapts to the posed images. The page shows its field at once, again after every few fine-tuning steps, and at
-the end as baked voxels, which turn without delay. With --checkpoint FILE, the page shows the voxels of a file that
-`bake` wrote. Ctrl-C ends the command.
+the end as baked voxels, which turn without delay. If --checkpoint is a file that `bake` wrote, the page shows its
+voxels. Ctrl-C ends the command.
 
 Example:
     hyperplanes view example-car
