@@ -1,6 +1,6 @@
-"""HyperPlanes: a hypernetwork reads a few posed images and writes a NeRF.
+"""HyperPlanes: a hypernetwork reads a few posed images of an object and predicts the weights of a NeRF.
 
-The public API. A name is imported on first use, so `import hyperplanes` is fast:
+This is the public API. A name is imported on first use, so `import hyperplanes` is fast:
 
     import hyperplanes as hp
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from hyperplanes.utilities.metrics import psnr, ssim
     from hyperplanes.views import Task, Views
 
-wait_passively()  # before PyTorch is loaded
+wait_passively()  # must run before PyTorch is loaded
 
 _HOMES = {
     "DataError": "data",
@@ -92,7 +92,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported on first use; `__version__` too."""
+    """A public name, imported on first use, or `__version__`."""
     if name == "__version__":
         from importlib.metadata import version
 

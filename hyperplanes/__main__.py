@@ -1,4 +1,4 @@
-"""`python -m hyperplanes`: the command `hyperplanes` where it is not on PATH."""
+"""`python -m hyperplanes` runs the command `hyperplanes`, even if that is not on PATH."""
 
 import sys
 

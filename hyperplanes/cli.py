@@ -1,6 +1,6 @@
-"""The command `hyperplanes VERB`. It parses and prints; the work is done in the other packages.
+"""The command `hyperplanes VERB`: it parses the command line, runs the verb and prints errors.
 
-A verb's module is imported only when that verb is asked for, so `hyperplanes --help` loads neither torch nor OpenGL.
+The module of a verb is imported only when the verb is used, so `hyperplanes --help` loads neither torch nor OpenGL.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: the command line after `hyperplanes`; by default that of this process.
 
     Returns:
-        The exit code: 0 done, 1 done but something is wrong, 2 wrong input, 130 interrupted, 143 terminated,
-        129 terminal closed. An unknown option and the help of a verb raise SystemExit.
+        The exit code: 0 for success, 1 if the verb finished but found a problem, 2 for wrong input, 130 if interrupted,
+        143 if terminated, 129 if the terminal was closed. An unknown option and the help of a verb raise SystemExit.
     """
     ended = None
     try:
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code, ended = 0, end
     written = _flush()
     if written is not None and code == 0:
-        return _complain(f"hyperplanes: standard output: {one_line(written)}")
+        return _print_error(f"hyperplanes: standard output: {one_line(written)}")
     if ended is not None:
         raise ended
     return code
@@ -51,7 +51,7 @@ def _flush() -> OSError | None:
         if sys.stdout is not None:
             sys.stdout.flush()
     except BrokenPipeError:
-        sys.stdout = None  # the reader of the output has gone, so there is nothing to flush to
+        sys.stdout = None  # the process that reads the output has ended: Python must not flush to it again
     except OSError as error:
         sys.stdout = None
         return error
@@ -63,24 +63,24 @@ def _main(arguments: Sequence[str] | None) -> int:
     traceback = "--traceback" in given or wants_traceback()
     given = [argument for argument in given if argument != "--traceback"]
     if not given or given[0] in ("-h", "--help", "help"):
-        return _say(_overview()) or (0 if given else 2)
+        return _print(_overview()) or (0 if given else 2)
     if given[0] == "--version":
         from importlib.metadata import version
 
-        return _say(f"hyperplanes {version('hyperplanes')}")
+        return _print(f"hyperplanes {version('hyperplanes')}")
     verb, *rest = given
     try:
         module = find_verb(verb).module
     except ValueError as error:
-        return _complain(f"hyperplanes: {error}")
+        return _print_error(f"hyperplanes: {error}")
     try:
         with interruptible():
             return _run(verb, module, rest)
     except KeyboardInterrupt as interrupt:
-        advice = str(interrupt) or "the same command goes on where it can"
+        advice = str(interrupt) or "the same command resumes where possible"
         code = interrupt.code if isinstance(interrupt, Terminated) else 130
         with suppress(OSError):  # the terminal may be closed
-            _complain(f"hyperplanes {verb}: {'interrupted' if code == 130 else 'terminated'}; {advice}")
+            _print_error(f"hyperplanes {verb}: {'interrupted' if code == 130 else 'terminated'}; {advice}")
         return code
     except BrokenPipeError:
         sys.stdout = None  # as in `_flush`
@@ -88,7 +88,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     except (ValueError, OSError, MemoryError, RuntimeError) as error:
         if traceback or not (isinstance(error, ValueError | OSError | MissingPackageError) or is_memory(error)):
             raise
-        return _complain(f"hyperplanes {verb}: {one_line(error)}")
+        return _print_error(f"hyperplanes {verb}: {one_line(error)}")
 
 
 def _run(verb: str, name: str, rest: list[str]) -> int:
@@ -103,7 +103,7 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
     parsed = tyro.cli(
         module.Arguments,
         prog=f"hyperplanes {verb}",
-        description="\n\n".join([inspect.cleandoc(module.__doc__ or ""), *_brought(module)]),
+        description="\n\n".join([inspect.cleandoc(module.__doc__ or ""), *_names_of_other_packages(module)]),
         args=rest,
         config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
     )
@@ -112,7 +112,7 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
 
 
 def _refuse_repeated(arguments: Sequence[str]) -> None:
-    """Refuse repeated options, of which the parsers would silently keep the last value.
+    """Refuse repeated options, because the parsers would silently keep only the last value.
 
     >>> _refuse_repeated(["--what", "images", "mesh", "--page-voxels=64", "--page_voxels", "96"])
     Traceback (most recent call last):
@@ -130,7 +130,7 @@ def _refuse_repeated(arguments: Sequence[str]) -> None:
 
 
 def _with_axes(arguments: list[str]) -> list[str]:
-    """The arguments with `--up -y` written `--up=-y`, since the parser would take `-y` for an option.
+    """The arguments with `--up -y` written as `--up=-y`, because the parser would read `-y` as an option.
 
     >>> _with_axes(["--up", "-y", "--size", "64"])
     ['--up=-y', '--size', '64']
@@ -145,7 +145,7 @@ def _with_axes(arguments: list[str]) -> list[str]:
 
 
 def _check_ranges(parsed: Any) -> None:
-    """Refuse whole numbers outside the range that a verb declares, which the parser does not check."""
+    """Refuse whole numbers outside the range that a verb declares, because the parser does not check it."""
     for name, hint in get_type_hints(type(parsed), include_extras=True).items():
         allowed = next((note for note in getattr(hint, "__metadata__", ()) if isinstance(note, range)), None)
         if allowed is not None and getattr(parsed, name) not in allowed:
@@ -153,26 +153,26 @@ def _check_ranges(parsed: Any) -> None:
             raise ValueError(f"--{name.replace('_', '-')}: expected {expected}, got {getattr(parsed, name)}")
 
 
-def _brought(module: ModuleType) -> list[str]:
-    """The names that other installed packages add to those that a verb takes; the packages are not imported."""
+def _names_of_other_packages(module: ModuleType) -> list[str]:
+    """Lines for the help of a verb: the names that other installed packages add. The packages are not imported."""
     groups: dict[str, str] = getattr(module, "BROUGHT", {})
     found = {what: sorted(each.name for each in find_entries(group)) for what, group in groups.items()}
     return [f"{what} of other packages: {', '.join(names)}." for what, names in found.items() if names]
 
 
-def _say(text: str) -> int:
-    """Print; returns the exit code."""
+def _print(text: str) -> int:
+    """Print a text to standard output; returns the exit code."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
         sys.stdout = None  # as in `_flush`
     except OSError as error:
         sys.stdout = None
-        return _complain(f"hyperplanes: standard output: {one_line(error)}")
+        return _print_error(f"hyperplanes: standard output: {one_line(error)}")
     return 0
 
 
-def _complain(line: str) -> int:
+def _print_error(line: str) -> int:
     print(line, file=sys.stderr)
     return 2
 
@@ -183,13 +183,13 @@ def _overview() -> str:
     verbs = "\n".join(f"  {name:<{width}}  {verb.about}" for name, verb in found.items())
     return (
         "usage: hyperplanes VERB [OPTIONS]\n\n"
-        "A hypernetwork looks at a few posed images of an object and writes a NeRF of it in one forward pass.\n\n"
-        f"verbs (`hyperplanes VERB --help` says more):\n{verbs}\n\n"
+        "A hypernetwork reads a few posed images of an object and predicts a NeRF of it in one forward pass.\n\n"
+        f"verbs (`hyperplanes VERB --help` lists the options):\n{verbs}\n\n"
         f"examples:\n{EXAMPLES}\n\n"
         "options:\n"
-        "  --help       this text\n"
-        "  --version    the version\n"
-        f"  --traceback  with any verb: show where an error came from (or set {TRACEBACK_VARIABLE}=1)"
+        "  --help       show this text\n"
+        "  --version    show the version\n"
+        f"  --traceback  with any verb: show the traceback of an error (or set {TRACEBACK_VARIABLE}=1)"
     )
 
 

@@ -1,7 +1,7 @@
 """The registry of methods, of this package and of others, by the names that `evaluate --method` takes.
 
-Where a method allows it, its name may end in a number of gradient steps on the support views (`hyperplanes_100`), in
-`_auto` for the number that is best for held-out views, or in `_swapped` for each object with the update of another.
+If a method allows it, its name may end in a number of gradient steps on the support views (`hyperplanes_100`), in
+`_auto` for the number that is best for held-out views, or in `_swapped` to give each object the update of another one.
 Another package adds a method by an entry point of the group `hyperplanes.methods` that names a `Method`.
 """
 
@@ -49,15 +49,15 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Request:
-    """What a method is made from.
+    """The arguments from which `make_method` makes a method.
 
     Attributes:
-        name: as requested, such as "hyperplanes_100".
-        checkpoints: their folders by the names of the methods that trained them, such as "hyperplanes".
-        device: of the weights.
-        settings: of fine-tuning.
-        objects: the support views of the objects to adapt to, which "hyperplanes_swapped" reads.
-        preset: the preset, or its name, with the shape of fields that need no checkpoint.
+        name: the requested name, such as "hyperplanes_100".
+        checkpoints: the folders of checkpoints, by the names of the methods that were trained, such as "hyperplanes".
+        device: the device of the weights.
+        settings: the settings of fine-tuning.
+        objects: the support views of the objects to adapt to; only "hyperplanes_swapped" reads them.
+        preset: the preset, or its name, that configures fields without a checkpoint.
         protocol: how such fields are sampled while they are optimised, as in `Preset.by_protocol`.
         reflections: whether models may use reflections of the views of a symmetric object.
         steps: gradient steps on the support views of an object, "auto", or None where the name has no number;
@@ -109,7 +109,7 @@ class Method:
         make: makes its adapter.
         steps: whether its name takes a number of gradient steps: "none", "optional", or "required".
         tuned: the description for "... after N fine-tuning steps"; empty if the steps are part of the method itself.
-        begins_at_zero: 0 steps are written _0, since the name without a number means another number of steps.
+        begins_at_zero: whether 0 steps are written _0, because the name without a number means another number of steps.
         swapped: makes the control in which each object gets the update of another, if there is one.
     """
 
@@ -121,7 +121,7 @@ class Method:
     swapped: Callable[[Request], Adapter] | None = None
 
     def describe(self, steps: Steps | None) -> str:
-        """The method in words, after a number of steps."""
+        """The description of the method with a number of steps."""
         if steps is None:
             return self.about
         kind = "fine-tuning steps" if self.tuned else "steps"
@@ -130,7 +130,7 @@ class Method:
 
 
 def _of_checkpoint(name: str) -> Callable[[Request], Adapter]:
-    """Makes the model of a method's checkpoint, fine-tuned if steps are requested."""
+    """A function that loads the model of a method's checkpoint, with fine-tuning if steps are requested."""
 
     def make(request: Request) -> Adapter:
         model = request.model(name)
@@ -236,15 +236,15 @@ METHODS: dict[str, Method] = {
         for name, about in LEARNED.items()
     },
 }
-"""The methods of this package. Those with "scratch" need a number of steps; an initialisation without a number is
-optimised for as many steps as its checkpoint says."""
+"""The methods of this package. Those with "scratch" need a number of steps. An initialisation without a number is
+optimised for the number of steps in the configuration of its checkpoint."""
 
 _SUFFIX = re.compile(r"(?P<base>.+)_(?P<steps>\d+|auto)")
 _SWAPPED = "_swapped"
 
 
 def find_methods() -> dict[str, Method]:
-    """All methods by name: of this package and of other installed packages, fields of these, and swapped controls."""
+    """All methods by name: those of this and of other installed packages, the fields of these, and swapped controls."""
     found = METHODS | load_entries("hyperplanes.methods", METHODS)
     found |= {name: _shared_weights(name, name) for name in find_targets() if name not in found}
     swapped = {
@@ -294,7 +294,7 @@ def at_steps(name: str, steps: Sequence[int]) -> list[str]:
 
 
 def describe_method(name: str) -> str:
-    """A method in words.
+    """The description of a method.
 
     >>> describe_method("hyperplanes_100")
     'HyperPlanes after 100 fine-tuning steps'
@@ -307,10 +307,10 @@ def describe_method(name: str) -> str:
 
 
 def make_method(request: Request) -> Adapter:
-    """The adapter behind a method's name.
+    """The adapter of a method.
 
     Returns:
-        An adapter; ValueError for an unknown name, or a checkpoint that the method needs and that is not given.
+        An adapter. ValueError if the name is unknown, or if the method needs a checkpoint that is not given.
     """
     _, method, steps = _parse(request.name)
     return method.make(replace(request, steps=steps))
@@ -318,18 +318,18 @@ def make_method(request: Request) -> Adapter:
 
 @dataclass(frozen=True)
 class WithSampler:
-    """A method whose fields are rendered by another protocol than the one they were trained with.
+    """A method whose fields are rendered with another sampler than the one they were trained with.
 
     Attributes:
         adapter: the method.
-        sampling: the protocol; None changes nothing. Results that are not fields take no samples and stay as they are.
+        sampling: the sampler; None changes nothing. Results that are not fields take no samples and stay unchanged.
     """
 
     adapter: Adapter
     sampling: Sampler | None
 
     def adapt(self, support: Views) -> Renderable:
-        """What the method makes of one object."""
+        """The result of the method for one object, with the sampler."""
         made = self.adapter.adapt(support)
         if self.sampling is None or not isinstance(made, AdaptedField):
             return made
@@ -338,7 +338,7 @@ class WithSampler:
 
 @dataclass(frozen=True)
 class Unchecked:
-    """A method whose fine-tuned fields count even if the steps ended in an empty picture, so tables hide no failure.
+    """A method that returns a fine-tuned field even if the steps made no progress, so that tables show the failure.
 
     Attributes:
         adapter: the method.
@@ -347,5 +347,5 @@ class Unchecked:
     adapter: Adapter
 
     def adapt(self, support: Views) -> Renderable:
-        """What the method makes of one object."""
+        """The result of the method for one object."""
         return made_anyway(lambda: self.adapter.adapt(support))

@@ -1,4 +1,4 @@
-"""Named tensors that add: theta + delta, the weights of a target network and their update (HyperPlanes, Eq. 6)."""
+"""Named tensors that can be added: the weights theta of a target network and an update delta (HyperPlanes, Eq. 6)."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class Parameters(dict[str, Tensor]):
 
     @classmethod
     def of(cls, module: nn.Module) -> Parameters:
-        """The parameters of a module, shared with it."""
+        """The parameters of a module; the tensors are shared with it."""
         return cls(module.named_parameters())
 
     def __add__(self, update: Mapping[str, Tensor]) -> Parameters:
-        """A copy in which the named tensors are shifted and the others shared.
+        """A copy in which the update is added to the tensors that it names; the other tensors are shared.
 
         Args:
-            update: tensors of the same names and shapes; names may be missing, none may be new.
+            update: tensors by name, with the same shapes. It may omit names, but not add new ones.
 
         Returns:
             New parameters; differentiable in both arguments.

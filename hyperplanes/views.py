@@ -1,4 +1,4 @@
-"""Views: posed images of one scene; Task: the support and query views of one object."""
+"""`Views` are posed images of one scene. A `Task` has the support and query views of one object."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class Views:
 
     Attributes:
         images: RGB in [0, 1], composited over white; shape (N, 3, H, W), as in PyTorch.
-        cameras: one a view, OpenCV axes, integer pixel centres.
+        cameras: one camera per view, with OpenCV axes and integer pixel centres.
         masks: opacity in [0, 1], or None for images without masks.
         bounds: the sphere that contains everything to be reconstructed.
-        names: where each view came from, for messages and file names.
-        up: the up direction stated by the files, as `data.upright.y_up_from` takes it; None where they state none.
+        names: the file of each view, for messages and file names.
+        up: the up direction stated by the files, as `data.upright.y_up_from` takes it; None if they state none.
     """
 
     images: Float[Tensor, "view 3 height width"]
@@ -78,7 +78,7 @@ class Views:
         return f"Views({len(self)} of {width}x{height}{masks}{names})"
 
     def _repr_html_(self) -> str:
-        """The pictures and where their cameras stand, for notebooks."""
+        """The images and the positions of their cameras, for notebooks."""
         return show_views(repr(self), self.images, self.cameras, self.bounds)
 
     def __getitem__(self, index: Selection) -> Views:
@@ -95,7 +95,7 @@ class Views:
 
     @property
     def nbytes(self) -> int:
-        """Memory of images and masks."""
+        """The bytes of images and masks."""
         return self.images.nbytes + (0 if self.masks is None else self.masks.nbytes)
 
     @property
@@ -105,7 +105,7 @@ class Views:
 
     @checked
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Views:
-        """The views on another device or in another precision, cameras included."""
+        """The views and their cameras on another device or in another precision."""
         return self._derived(
             images=self.images.to(device=device, dtype=dtype),
             cameras=camera.to(self.cameras, device, dtype),
@@ -114,7 +114,7 @@ class Views:
 
     @checked
     def resized(self, longest: int) -> Views:
-        """The views scaled down so that the longer side has `longest` pixels; smaller views stay as they are."""
+        """The views scaled down so that the longer side has `longest` pixels; smaller views stay unchanged."""
         if longest < 1:
             raise ValueError(f"longest: expected at least 1 pixel, got {longest}")
         scale = longest / max(self.size)
@@ -127,7 +127,7 @@ class Views:
         return self._derived(images=images, masks=masks, cameras=camera.resized(self.cameras, *size))
 
     def _derived(self, **changes: Any) -> Views:
-        """The same views with some attributes replaced, which are not checked again."""
+        """The same views with some attributes replaced, without the checks of the constructor."""
         views = object.__new__(type(self))
         views.__dict__.update({**self.__dict__, **changes})
         return views
@@ -148,11 +148,11 @@ class Views:
         among: Int[Tensor, " pixel"] | None = None,
         near_far: str = "sphere",
     ) -> tuple[Rays, Float[Tensor, "ray 3"]]:
-        """Rays through pixels drawn uniformly from all views, and their colours.
+        """Rays through pixels drawn uniformly from all views, and the colours of these pixels.
 
         Args:
-            count: how many, drawn with replacement.
-            generator: on the CPU, so that every device draws the same.
+            count: the number of rays, drawn with replacement.
+            generator: a generator on the CPU, so that every device draws the same pixels.
             among: flat indices (view, row, column) of the pixels to draw from; by default all.
             near_far: as in `geometry.cast`.
 
@@ -170,13 +170,14 @@ class Views:
         near_far: str = "sphere",
         subpixels: Sequence[tuple[float, float]] = ((0.0, 0.0),),
     ) -> tuple[Rays, Float[Tensor, "drawn 3"], Float[Tensor, "drawn 1"]]:
-        """As `sample_rays`, with the opacity of the masks; 1 without masks.
+        """As `sample_rays`, also returning the opacity of the masks, which is 1 without masks.
 
-        `subpixels` are offsets from the centre of a pixel: the rays through the first offset of every pixel come first,
-        then those through the second, and so on (`Rendered.pooled`). Each pixel has one colour and one opacity.
+        `subpixels` are offsets from the centre of a pixel, in pixels (column, row). The rays through the first offset
+        of every pixel come first, then those through the second, and so on (`Rendered.pooled`). Each pixel has one
+        colour and one opacity.
 
         Raises:
-            ValueError: no pixel to draw from.
+            ValueError: less than one ray, or no pixel to draw from.
         """
         if count < 1:
             raise ValueError(f"count: expected at least 1 ray, got {count!r}")
@@ -201,13 +202,13 @@ class Views:
         """The rays through some pixels.
 
         Args:
-            pixels: their flat indices (view, row, column).
+            pixels: flat indices (view, row, column) of the pixels.
             near_far: as in `geometry.cast`.
             subpixels: as in `sample_masked_rays`.
 
         Returns:
-            The rays, the colours of the pixels, and the opacity of the masks; 1 without masks. Raises ValueError for an
-            index out of range.
+            The rays, the colours of the pixels, and the opacity of the masks, which is 1 without masks. On a CPU an
+            index out of range raises ValueError.
         """
         height, width = self.size
         if pixels.device.type == "cpu":  # a GPU would have to synchronise
@@ -220,7 +221,7 @@ class Views:
         height, width = self.size
         view, pixel = pixels // (height * width), pixels % (height * width)
         row, column = pixel // width, pixel % width
-        places = torch.stack([column, row], -1).to(self.cameras.extrinsics)  # images may have too low a precision
+        places = torch.stack([column, row], -1).to(self.cameras.extrinsics)  # the dtype of images may be too coarse
         places = torch.cat([places + places.new_tensor(each) for each in subpixels])
         rays = cast(self.cameras, view.repeat(len(subpixels)), places, self.bounds, near_far=near_far)
         colours = self.images[view, :, row, column]
@@ -232,7 +233,10 @@ class Views:
 
 
 def join_views(first: Views, *others: Views) -> Views:
-    """Several sets of views of a scene as one, with the sphere of the first, and with masks if all have them."""
+    """Several sets of views of a scene as one, with the bounds and the up direction of the first.
+
+    The result has masks if all sets have masks, and names if all have names.
+    """
     parts = (first, *others)
     masks = [each.masks for each in parts if each.masks is not None]
     names = tuple(name for each in parts for name in each.names) if all(each.names for each in parts) else ()
@@ -247,23 +251,23 @@ def join_views(first: Views, *others: Views) -> Views:
 
 
 def moved(views: Views, motion: Float[Tensor, "4 4"]) -> Views:
-    """The views of an object after a rigid motion: the same pictures, whose cameras move with it.
+    """The views of an object after a rigid motion: the same images, with cameras that move with the object.
 
     Args:
-        views: of the object.
-        motion: in world coordinates, in float64.
+        views: the views of the object.
+        motion: the motion in world coordinates, (4, 4), in float64.
     """
     return views._derived(cameras=camera.moved(views.cameras, motion))
 
 
 @dataclass(frozen=True)
 class Task:
-    """One object: the views that a method gets, and those that it is evaluated on (HyperPlanes, Eq. 5).
+    """One object: the views that a method is given, and the views that it is evaluated on (HyperPlanes, Eq. 5).
 
     Attributes:
-        support: the views the method may use.
-        query: disjoint views of the same object.
-        name: of the object.
+        support: the views that the method may use.
+        query: other views of the same object.
+        name: the name of the object.
     """
 
     support: Views
@@ -283,11 +287,11 @@ class Tasks(Protocol):
     """A data set of tasks."""
 
     def names(self, split: str) -> Sequence[str]:
-        """The objects of a split."""
+        """The names of the objects of a split."""
         ...
 
     def task(self, name: str) -> Task:
-        """One object."""
+        """The views of one object."""
         ...
 
 
@@ -296,10 +300,10 @@ class Classified(Protocol):
     """Tasks whose objects have classes."""
 
     def class_of(self, name: str) -> str:
-        """The class of one object; empty where it is not stated."""
+        """The class of one object; empty if it is not stated."""
         ...
 
 
 def class_of(data: Tasks, name: str) -> str:
-    """The class of an object; empty where the data set does not state it."""
+    """The class of an object; empty if the data set does not state it."""
     return data.class_of(name) if isinstance(data, Classified) else ""

@@ -238,7 +238,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ),
         ([*RENDER, "--orbit", "0"], ["--orbit: expected 1 to 10000 frames, got 0"]),
         ([*RENDER, "--orbit", "100000000"], ["--orbit: expected 1 to 10000 frames, got 100000000"]),
-        ([*RENDER, "--size", "32"], ["--size: expected --orbit or --camera-path, whose pictures it is for, got 32"]),
+        ([*RENDER, "--size", "32"], ["--size: expected --orbit or --camera-path as well, got 32 alone"]),
         ([*RENDER, "--orbit", "2", "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
         ([*BAKE, "OUT/bk"], ["--out: expected a name that ends in .safetensors, got OUT/bk"]),
         (
@@ -267,14 +267,14 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         (["train", "--data", "--out", "OUT/run"], ["data: expected at least one folder, got none"]),
         ([*RENDER, "--rendered-output-names"], ["--rendered-output-names: expected at least one"]),
         ([*RENDER, "--turntable", "gif"], ["--turntable: expected --orbit or --camera-path"]),
-        ([*BAKE, "OUT/b.safetensors", "--turntable", "gif"], ["--turntable: expected --orbit, whose animation it is"]),
+        ([*BAKE, "OUT/b.safetensors", "--turntable", "gif"], ["--turntable: expected --orbit as well, got gif alone"]),
         (
             ["evaluate", "--data", "DATA", "--method", "nearest_view", "--fine-tune", "hypernetwork"],
-            ["--fine-tune: expected --steps, which optimise so, got hypernetwork alone"],
+            ["--fine-tune: expected --steps as well, got hypernetwork alone"],
         ),
         (
             ["adapt", *RENDER[1:], "--fine-tune", "hypernetwork"],
-            ["--fine-tune: expected --steps, which optimise so, got hyper"],
+            ["--fine-tune: expected --steps as well, got hyper"],
         ),
         (
             ["train", "--data", "DATA", "--training.steps", "3", "--epochs", "1", "--out", "OUT/run"],
@@ -306,9 +306,9 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ([*RENDER, "--dataparser-transforms", "OUT/a"], ["--dataparser-transforms: expected --camera-path"]),
         ([*BAKE, "OUT/bk.safetensors", "--orbit", "0"], ["--orbit: expected 1 to 10000 frames, got 0"]),
         (["export", *RENDER[1:], "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
-        (["export", *RENDER[1:], "--what", "mesh", "--size", "64"], ["--size: expected --what turntable, whose"]),
+        (["export", *RENDER[1:], "--what", "mesh", "--size", "64"], ["--size: expected --what turntable as well, got"]),
         *(
-            (["export", *RENDER[1:], *more.split()], [f"{more.split()[-2]}: expected {wanted}, whose option it is"])
+            (["export", *RENDER[1:], *more.split()], [f"{more.split()[-2]}: expected {wanted} as well, got"])
             for more, wanted in (
                 ("--what mesh --frames 7", "--what turntable"),
                 ("--what mesh --turntable gif", "--what turntable"),
@@ -326,7 +326,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         (["export", *RENDER[1:], "--what"], ["--what: expected at least one of images, turntable, mesh, page"]),
         (
             ["demo", "--quick-check", "--objects", "9", "--out", "OUT/demo"],
-            ["--objects: expected none with --quick-check, which has its own"],
+            ["--objects: expected none with --quick-check, which sets its own"],
         ),
         *(
             (
@@ -376,7 +376,7 @@ def test_pictures_are_not_written_over_those_that_are_read(verb, out, more, tmp_
     before = {path: path.read_bytes() for path in (tmp_path / "photos").rglob("*") if path.is_file()}
     arguments = [verb, "--checkpoint", str(demo_folder() / "hyperplanes"), "--views", "photos", "--out", out, *more]
     assert main(arguments) == 2
-    assert "--out: expected a folder that no pictures or poses are read from, got photos/images" in complaint(capsys)
+    assert "--out: expected a folder that no images or poses are read from, got photos/images" in complaint(capsys)
     assert {path: path.read_bytes() for path in (tmp_path / "photos").rglob("*") if path.is_file()} == before
 
 
@@ -1009,9 +1009,9 @@ def test_a_single_scene_is_evaluated_with_the_way_up_that_its_cameras_tell(tmp_p
 
     capsys.readouterr()
     expected = quality(scene)
-    assert "up: y, from how the cameras are held; --up overrides it" in capsys.readouterr().out
+    assert "up: y, guessed from how the cameras are held; --up overrides it" in capsys.readouterr().out
     assert quality(turned) == pytest.approx(expected, abs=1e-2)
-    assert "up: z, from how the cameras are held; --up overrides it" in capsys.readouterr().out
+    assert "up: z, guessed from how the cameras are held; --up overrides it" in capsys.readouterr().out
     assert quality(turned, "--up", "0,0,2") == pytest.approx(expected, abs=1e-2)
     assert quality(turned, "--up", "-z") == quality(turned, "--up=-z") < expected - 0.1
     assert abs(quality(turned, "--up", "y") - expected) > 0.1
@@ -1031,7 +1031,7 @@ def test_photographs_with_a_background_are_warned_about_and_ways_up_are_said(tmp
     command = ["render", "--checkpoint", str(demo_folder()), "--views", str(scene), "--out", str(tmp_path / "out")]
     assert main(command) == 0
     shown = capsys.readouterr()
-    assert "up: y, from how the cameras are held; --up overrides it" in shown.out
+    assert "up: y, guessed from how the cameras are held; --up overrides it" in shown.out
     assert "rendering 6/6" in shown.out
     assert "the views have no alpha and no masks" in shown.err
     assert re.search("worse than copying the nearest view: .*; cut the object out first", shown.err)
@@ -1061,7 +1061,7 @@ def test_the_demonstration_reads_meshes_before_it_renders_classes(tmp_path):
 def test_the_demonstration_shows_the_packaged_model_before_anything_is_trained(tmp_path, capsys):
     page = (demo_folder() / "first.html").read_text(encoding="utf-8")
     assert all(words in page for words in ("3 views", "car_test_00000", "data:image/webp"))
-    assert "How it learned" not in page
+    assert "<h2>Training</h2>" not in page
     command = ["demo", "--quick-check", "--first-only", "--meshes", str(tmp_path), "--out", str(tmp_path / "out")]
     with small_demo():
         assert main(command) == 2
@@ -1084,14 +1084,14 @@ def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_pa
         patch.setattr(Trainer, "take_step", interrupted)
         assert main([*command, str(parts)]) == 130
     at_once, at_the_end = capsys.readouterr().err.strip().splitlines()
-    assert at_once == "SIGINT: stopping after this step; once more to stop at once"
-    assert "the same command goes on" in at_the_end
+    assert at_once == "SIGINT: stopping after this step; send it again to stop at once"
+    assert "run the same command again to resume" in at_the_end
     assert main([*command, str(parts)]) == 0
-    assert "going on from step 3" in capsys.readouterr().out
+    assert "resuming from step 3" in capsys.readouterr().out
     assert main([*command, str(whole)]) == 0
     assert capsys.readouterr().out.count("trained for 4 steps\n") == 1
     assert main([*command[:6], "3", *command[7:], str(whole)]) == 0
-    assert "trained for 4 steps before, and for no more now: --steps is 3" in capsys.readouterr().out
+    assert "trained for 4 steps before; nothing was trained now, because --steps is 3" in capsys.readouterr().out
     same = (parts / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
     assert same
 

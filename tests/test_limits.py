@@ -131,7 +131,7 @@ def test_a_field_that_cannot_be_kept_is_there(scene, monkeypatch, capsys):
     model, views = HyperPlanes.from_pretrained(scene / "model"), read_views(scene / "scene")
     field, _ = fields.adapt_to(model, views, "a", Console())
     folder = kept_folder(model, views, 0, FineTuning())
-    assert f"{folder}: not kept for another time: " in capsys.readouterr().err
+    assert f"{folder}: not kept for later commands: " in capsys.readouterr().err
     assert field.density(torch.zeros(1, 3)).shape == (1,)
 
 

@@ -1,7 +1,7 @@
-"""The verbs of the command line, one a module: a dataclass `Arguments` and a function `run`.
+"""The verbs of the command line. Each is a module with a dataclass `Arguments` and a function `run`.
 
-Another package adds a verb by an entry point of the group `hyperplanes.commands` that names a `Verb`, in a module that
-imports nothing heavy; so does data_gen with `generate` and `inspect`.
+Another package adds a verb by an entry point of the group `hyperplanes.commands` that names a `Verb`, as data_gen does
+with `generate` and `inspect`. The module of that `Verb` must import nothing heavy.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class Verb:
     """A verb of the command line.
 
     Attributes:
-        module: Name of the module with its `Arguments` and its `run`, imported when the verb is used.
-        about: One line about it.
+        module: Name of the module that has its `Arguments` and its `run`. It is imported when the verb is used.
+        about: A description in one line.
     """
 
     module: str
@@ -35,20 +35,20 @@ class Verb:
 
 
 VERBS: dict[str, str] = {
-    "reproduce": "a table or figure of the paper, beside the paper's numbers",
-    "demo": "everything once, small: data, training, new views and a report, in minutes",
+    "reproduce": "reproduce a table or a figure of the paper, beside the paper's numbers",
+    "demo": "make data, train, render new views and write a page about them, in minutes",
     "train": "train a model on a data set",
-    "evaluate": "compare methods on objects they have never seen, as one table",
-    "capture": "photographs or a video to a scene: camera poses, masks, which way is up",
-    "render": "new views of one object from a few posed images",
-    "view": "one object in the browser, while a model adapts to it",
-    "export": "one object as images, a turntable, a mesh, splats, and a page that turns it",
-    "bake": "one object as a small file of voxels that renders at once, without any network",
-    "adapt": "write the weights of one object, to be rendered later without the hypernetwork",
+    "evaluate": "compare methods on held-out objects, in one table",
+    "capture": "make a scene with camera poses and masks from photographs or a video",
+    "render": "render new views of one object from a few posed images",
+    "view": "show one object in the browser while a model adapts to it",
+    "export": "write one object as images, a turntable, a mesh, points, splats or an HTML page",
+    "bake": "write one object as a small file of voxels, which are rendered without a network",
+    "adapt": "write the weights of one object, for rendering without the hypernetwork",
     "presets": "list the named configurations",
-    "doctor": "say what works on this machine, and how to fix what does not",
+    "doctor": "report what works on this machine, and how to fix what does not",
 }
-"""The verbs of this package with one line about each, in the order of the overview."""
+"""The verbs of this package and a description of each, in the order of the overview."""
 
 EXAMPLES = """\
   hyperplanes demo
@@ -68,7 +68,7 @@ def find_verb(name: str) -> Verb:
     """One verb.
 
     Args:
-        name: As it stands on the command line.
+        name: Its name on the command line.
 
     Returns:
         The verb.
@@ -85,16 +85,16 @@ def find_verb(name: str) -> Verb:
 
 
 def split_settings(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The options of a verb, and those with a dot in their names, which set a field of a model or a training.
+    """Separate the options of a verb from those with a dot in their names, which set a field of a model or a training.
 
     >>> split_settings(["--model.network.depth", "4", "--out", "runs/a.b"])
     (['--out', 'runs/a.b'], ['--model.network.depth', '4'])
 
     Args:
-        arguments: What stands after the verb.
+        arguments: The command line after the verb.
 
     Returns:
-        Both, each option with its values.
+        The options without and those with a dot, each followed by its values.
     """
     plain: list[str] = []
     dotted: list[str] = []

@@ -1,7 +1,7 @@
-"""Write the weights of one object: theta plus the update that the hypernetwork makes from a few posed images of it.
+"""Write the weights of one object: theta plus the update that the hypernetwork predicts from a few posed images of it.
 
-The result is a checkpoint without a hypernetwork. `render` and `export` take it like any other, together with the same
-images, which the field looks its colours up in.
+The result is a checkpoint without a hypernetwork. `render` and `export` take it like any other checkpoint, together
+with the same images, because the field reads its colours from them.
 
 Example:
     hyperplanes adapt --checkpoint runs/demo --views scene --out chair-weights --steps 100
@@ -24,10 +24,10 @@ __all__ = ["Arguments", "run"]
 
 @dataclass(frozen=True)
 class Arguments(ObjectArguments):
-    """What to adapt to.
+    """The options of `adapt`.
 
     Attributes:
-        fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
+        fine_tune: What fine-tuning optimises: the weights theta + delta, or the hypernetwork while theta is frozen.
     """
 
     fine_tune: Free = "weights"

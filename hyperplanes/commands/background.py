@@ -1,4 +1,4 @@
-"""Views without masks cut out of their background before a verb adapts to them."""
+"""Cuts the object out of the background of views without masks, before a verb adapts to them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ __all__ = ["cut_out_task"]
 
 
 def cut_out_task(task: Task, console: Console, *, all_views: bool = False) -> Task:
-    """The views with masks and over white, by a background that is learned from the support views.
+    """The task with masks and images over white, by a background model that is fitted to the support views.
+
+    Views that already have masks are returned unchanged.
 
     Args:
-        task: the views to show and those to ask for.
-        console: where it is said.
-        all_views: both are the same.
+        task: the support and the query views.
+        console: prints what was found.
+        all_views: whether support and query views are the same.
 
     Raises:
-        ValueError: too few views, or nothing that is told from the background.
+        ValueError: too few views, or no object that differs from the background.
     """
     from hyperplanes.adaptation.background import Separated, separate_background
     from hyperplanes.adaptation.kept import keep_tensors, kept_file, recall_tensors
@@ -32,7 +34,7 @@ def cut_out_task(task: Task, console: Console, *, all_views: bool = False) -> Ta
 
     shown, started = task.support, time.perf_counter()
     if shown.masks is not None:
-        console.say("background: not learned, the views come with masks")
+        console.say("background: not learned, because the views have masks")
         return task
     file = kept_file("background", shown)
     kept = recall_tensors(file, ("inner", "outer"))
@@ -59,4 +61,4 @@ def cut_out_task(task: Task, console: Console, *, all_views: bool = False) -> Ta
 
 
 LEAST_SHARE = 0.002
-"""Of the pictures, below which nothing was found."""
+"""Least share of the pixels that an object covers; with less, no object was found."""

@@ -1,8 +1,8 @@
-"""Turn one adapted object into a sparse voxel grid: one small file that renders at once, without any network.
+"""Turn one adapted object into a sparse voxel grid: one small file that is rendered quickly, without a network.
 
-Density and view-dependent colour (spherical harmonics) are kept for the voxels that can be seen. What it costs is said:
-the baked pictures are compared with the field's own and with the true query views. The voxels are fitted to the shown
-views, which brings back what baking loses, and more.
+The grid has the density and the view-dependent colour (spherical harmonics) of the voxels that can be seen. They are
+fitted to the support views, which recovers what baking loses, and more. To show the cost, the output has the PSNR of
+the baked pictures and of the field's own pictures on the query views.
 
 Example:
     hyperplanes bake --checkpoint runs/demo --views scene --out chair.safetensors
@@ -33,14 +33,15 @@ __all__ = ["Arguments", "run"]
 
 @dataclass(frozen=True)
 class Arguments(ObjectArguments):
-    """What to bake.
+    """The options of `bake`.
 
     Attributes:
-        voxels: Along each side of the grid; 1.4 for every pixel of the images, and at most 256, when not given.
-        fit: Gradient steps that fit the voxels to the shown views; 0 keeps what the field shows.
+        voxels: Voxels along each side of the grid. By default 1.4 per pixel of the images, at least 64 and at most 256.
+        fit: Gradient steps that fit the voxels to the support views. With 0, they keep the field's colours and
+            densities.
         orbit: Also write a turntable of this many frames beside the file, rendered from the voxels.
-        size: Pixels along the longer side of the turntable; as the images when not given.
-        turntable: The format of the turntable; mp4 and webm need `pip install 'hyperplanes[video]'`.
+        size: Pixels along the longer side of the turntable. By default as many as the images have.
+        turntable: The file format of the turntable. mp4 and webm need `pip install 'hyperplanes[video]'`.
     """
 
     voxels: OptionalInt = None
@@ -57,13 +58,13 @@ def _timed(action: Callable[[], Tensor]) -> tuple[float, Tensor]:
 
 
 def _refuse_sources(arguments: Arguments, task: Task | None = None) -> None:
-    """As `refuse_sources`, where a turntable is written, which would be read as a picture of the scene."""
+    """As `refuse_sources`, if a turntable is written, because it could be read later as an image of the scene."""
     if arguments.orbit is not None:
         refuse_sources(arguments.out.parent, arguments.views, task)
 
 
 def run(arguments: Arguments) -> int:
-    """Adapt, bake, write, and say what it cost and what it brought."""
+    """Adapt, bake, write the file, and print the speed and the PSNR of the voxels."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.baking import BakedScene, coarsening, default_side
@@ -82,7 +83,7 @@ def run(arguments: Arguments) -> int:
     if arguments.orbit is not None:
         require_encoder(arguments.turntable)
     elif arguments.turntable != "webp":
-        raise ValueError(f"--turntable: expected --orbit, whose animation it is of, got {arguments.turntable} alone")
+        raise ValueError(f"--turntable: expected --orbit as well, got {arguments.turntable} alone; add --orbit")
     if arguments.voxels is not None:
         with rename_errors("side", "--voxels"):
             coarsening(arguments.voxels)
@@ -102,10 +103,10 @@ def run(arguments: Arguments) -> int:
     scene = BakedScene(baked)
     first = camera.select(query.cameras, [0])
     for each in (scene, field):
-        each.render(first)  # compiles, and finds where the field is not empty
+        each.render(first)  # compile kernels and find the occupied voxels before time is measured
     slow, before = _timed(lambda: field.render(query.cameras).images.clamp(0, 1).cpu())
     fast, after = _timed(lambda: scene.render(query.cameras).images.clamp(0, 1))
-    kind = "shown" if arguments.all_views else "query"
+    kind = "support" if arguments.all_views else "query"
     console.say(
         f"{len(query)} {kind} views: {format_duration(fast / len(query))} each, "
         f"{slow / fast:.0f} times the field's speed; "

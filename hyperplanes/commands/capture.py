@@ -1,6 +1,7 @@
-"""Turn photographs or a video of an object into a scene that the other verbs read: camera poses, masks, what is up.
+"""Turn photographs or a video of an object into a scene for the other verbs, with camera poses, masks and up direction.
 
-Needs the extra `photos`: pip install 'hyperplanes[photos]'. An interrupted capture resumes where it stopped.
+This needs the extra `photos`: pip install 'hyperplanes[photos]'. To resume an interrupted capture, run the same command
+again.
 
 Example:
     hyperplanes capture photos/ --out scene
@@ -32,17 +33,17 @@ __all__ = ["Arguments", "run"]
 
 @dataclass(frozen=True)
 class Arguments:
-    """What was photographed, and how to look at it.
+    """The options of `capture`.
 
     Attributes:
-        photographs: A folder of photographs, in which masks/ may lie, or a video.
-        out: The folder for the scene: images/, masks/ and transforms.json as nerfstudio has them.
-        mask: What finds the object in the pictures: auto, given (alpha, or masks/ beside them), colour (in front of a
-            plain background), network, grabcut, none, or a command with {image} and {mask} in it.
-        size: Pixels along the longer side of the pictures, at most.
-        order: Whether neighbours are matched, as in a video, or any photograph with any other; auto goes by their
-            number.
-        frames: Taken out of a video.
+        photographs: A folder of photographs, which may contain a folder masks/, or a video.
+        out: The folder for the scene: images/, masks/ and transforms.json in nerfstudio's layout.
+        mask: How the object is found in the images: auto, given (alpha, or masks/ beside them), colour (in front of a
+            plain background), network, grabcut, none, or a command that contains {image} and {mask}.
+        size: Most pixels along the longer side of the images.
+        order: Which photographs are matched. sequence: neighbours, as in a video. any: all pairs. auto: neighbours for
+            a video and for many photographs, otherwise all pairs.
+        frames: Frames that are taken from a video.
     """
 
     photographs: tyro.conf.Positional[Path]
@@ -55,7 +56,7 @@ class Arguments:
 
 @writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
-    """Find poses and masks, write the scene, say what was found and what was left out."""
+    """Find poses and masks, write the scene, and print what was found and what was left out."""
     from hyperplanes.capture import Settings, capture
 
     console, started = Console(), time.perf_counter()
@@ -65,7 +66,7 @@ def run(arguments: Arguments) -> int:
 
         def progress(stage: str, done: int, total: int, text: str) -> None:
             nonlocal shown
-            if shown is None or shown[0] != stage:  # stages return where photographs are tried again
+            if shown is None or shown[0] != stage:  # a stage comes again if photographs are tried a second time
                 stack.close()
                 shown = stage, stack.enter_context(console.bar(stage))
             shown[1].show(done, total, text, important=done == 0)

@@ -1,4 +1,4 @@
-"""What works on this machine: tried, not guessed, and each problem with what fixes it."""
+"""Checks of what works on this machine, with a remedy for each problem."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ OPTIONAL = {
     "onnxruntime": ("photos", "capture: masks by a network"),
     "cv2": ("photos", "capture: masks by colour"),
 }
-"""What some things need: modules, each the extra that installs it, and what for."""
+"""Modules of optional packages. For each: the extra that installs it, and what needs it."""
 
 SMALLEST_FREE = 2 * 2**30
 
 GROUP = "hyperplanes.checks"
-"""Entry points of functions that return further checks: of data_gen, its renderers."""
+"""The group of entry points of functions that return further checks, such as those of the renderers of data_gen."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at.
+    """The result of one check.
 
     Attributes:
-        name: of it.
-        works: whether it does.
-        needed: whether the main job cannot run without it.
+        name: what was checked.
+        works: whether it works.
+        needed: whether `hyperplanes demo` cannot run without it.
         detail: what was found.
-        remedy: what to do where it does not work; one command where there is one.
+        remedy: what to do if it does not work, as one command if possible; empty if nothing is known.
     """
 
     name: str
@@ -60,12 +60,12 @@ class Check:
 
 
 def healthy(checks: Sequence[Check]) -> bool:
-    """Whether all that the main job needs works."""
+    """Whether everything works that `hyperplanes demo` needs."""
     return all(check.works or not check.needed for check in checks)
 
 
 def examine() -> list[Check]:
-    """The outcomes of all checks, needed things first."""
+    """The results of all checks; Python, torch and the required packages come first."""
     checks = [_python(), _torch(), _packages()]
     if all(check.works for check in checks):
         checks += _lookups()
@@ -131,7 +131,7 @@ def _lookups() -> list[Check]:
 def _disk(folder: Path) -> Check:
     free = shutil.disk_usage(folder).free
     detail = f"{free / 2**30:.1f} GiB free in {folder.resolve()}"
-    return Check("disk", free > SMALLEST_FREE, False, detail, "free some, a data set of 70 objects takes 20 MB")
+    return Check("disk", free > SMALLEST_FREE, False, detail, "free some space; a data set of 70 objects takes 20 MB")
 
 
 def _optional(module: str) -> Check:

@@ -1,4 +1,4 @@
-"""What a person sees: plain lines, and one live line where there is a terminal."""
+"""Output of the verbs: lines, tables and progress lines, which a terminal redraws in place."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from rich.table import Table
 __all__ = ["Bar", "Console"]
 
 QUIET_SECONDS = 10.0
-"""Time between progress lines where there is no terminal."""
+"""Least time between two progress lines if they are not redrawn in place."""
 
 
 class Bar:
-    """Progress towards a known number: redrawn in place in a terminal, a line now and then elsewhere."""
+    """A progress line: a terminal redraws it in place; otherwise a new line is printed every QUIET_SECONDS."""
 
     def __init__(self, console: RichConsole, errors: RichConsole, progress: Progress | None, title: str) -> None:
         self._console, self._errors, self._progress, self._title = console, errors, progress, title
@@ -28,13 +28,13 @@ class Bar:
         self._printed = time.monotonic()
 
     def show(self, done: int, total: int, text: str, *, important: bool = False) -> None:
-        """Move on.
+        """Update the progress line.
 
         Args:
-            done: of the total.
-            total: when it is finished.
-            text: what to say about now.
-            important: worth a line of its own where nothing is redrawn.
+            done: the amount of work that is done.
+            total: the whole amount.
+            text: what is shown after both numbers.
+            important: print a line at once if nothing is redrawn in place.
         """
         if self._progress is not None:
             if self._task is None:
@@ -45,14 +45,14 @@ class Bar:
             self._console.print(f"{self._title} {done}/{total}  {text}", markup=False, highlight=False, soft_wrap=True)
 
     def warn(self, line: str) -> None:
-        """A line on standard error, above the progress line."""
+        """Print a line on standard error, above the progress line."""
         _show(self._errors, line)
 
 
 class _Terminal:
-    """Standard output or error; what is written after its terminal was closed is dropped, as to nobody.
+    """Standard output or error, which drops what is written after its terminal was closed.
 
-    A training whose terminal is closed is about to write its checkpoint, and is not to fail at a line of progress.
+    A training whose terminal is closed still has to write its checkpoint, so a progress line must not raise an error.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -81,7 +81,7 @@ def _unless_closed() -> Generator[None]:
 
 
 class _Stream(RichConsole):
-    """Rich's console, which leaves it to the caller what a reader who has gone means; its own exit code is 1."""
+    """Rich's console, which raises BrokenPipeError for the caller to handle; Rich would exit with code 1."""
 
     def on_broken_pipe(self) -> None:
         raise
@@ -91,8 +91,8 @@ class Console:
     """Standard output for results, standard error for warnings.
 
     Args:
-        silent: nothing is shown, as in the processes of a training that another one speaks for.
-        plain: nothing is redrawn in a terminal either, which several processes share.
+        silent: print nothing, as in all but the first process of a training.
+        plain: redraw nothing in place, because several processes share the terminal.
     """
 
     def __init__(self, *, silent: bool = False, plain: bool = False) -> None:
@@ -101,15 +101,15 @@ class Console:
         self._live = self._out.is_terminal and not silent and not plain
 
     def say(self, line: str) -> None:
-        """A line of its own."""
+        """Print a line on standard output."""
         _show(self._out, line)
 
     def warn(self, line: str) -> None:
-        """A line on standard error."""
+        """Print a line on standard error."""
         _show(self._errors, line)
 
     def table(self, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """A table; all columns but the first are aligned to the right."""
+        """Print a table; all columns but the first are aligned to the right."""
         if not self._live:
             widths = [max(len(row[i]) for row in [headings, *rows]) for i in range(len(headings))]
             for row in [headings, *rows]:
@@ -126,10 +126,10 @@ class Console:
 
     @contextmanager
     def bar(self, title: str) -> Generator[Bar]:
-        """A progress line for as long as the context lasts.
+        """A context with a progress line.
 
         Yields:
-            What shows it.
+            The progress line.
         """
         if not self._live:
             yield Bar(self._out, self._errors, None, title)

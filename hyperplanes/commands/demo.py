@@ -1,8 +1,8 @@
-"""The whole method once, small: procedural cars, training, new views of cars it has never seen, and a page about it.
+"""Run the whole method at a small scale: generate cars, train, render new views of held-out cars, and write a page.
 
-Before that, the packaged model shows what needs no training, in first.html. Takes minutes on two cores. Everything goes
-to --out: the data sets, the checkpoints, metrics.json and report.html.
-Interrupted, the same command goes on; run again, it does only what is not done yet.
+Before that, the packaged model renders objects without training; the result is first.html. The command takes minutes on
+two cores. It writes everything to --out: the data sets, the checkpoints, metrics.json and report.html. After an
+interruption, run the same command again: it does only what is not done yet.
 
 Example:
     hyperplanes demo
@@ -38,22 +38,22 @@ __all__ = ["Arguments", "run", "settings_of"]
 
 @dataclass(frozen=True)
 class Arguments:
-    """How large, and where to.
+    """The options of `demo`.
 
     Attributes:
-        out: The folder for everything.
-        class_name: Which procedural objects.
-        objects: How many, the held-out ones included.
-        held_out: How many of them are kept from training.
-        resolution: Pixels along a side.
-        preset: What is trained; see `hyperplanes presets`.
-        steps: Training steps; so few that all is done in minutes on two cores.
-        meshes: A folder with a few mesh files that the packaged model shows first, beside procedural objects.
-        first_only: End after the packaged model's page.
-        seed: Of the data, the trainings and the evaluation.
-        workers: Processes that train and evaluate side by side, with one thread each, by which fine-tuned scores may
-            differ in their last digits from those of one process; one a core, at most four, when not given.
-        quick_check: Only see that everything runs: a few tiny objects and networks that learn nothing.
+        out: The folder for all results.
+        class_name: The class of the procedural objects.
+        objects: The number of objects, including the held-out ones.
+        held_out: The number of objects that are kept out of training.
+        resolution: Pixels along a side of the images.
+        preset: The configuration that is trained; see `hyperplanes presets`.
+        steps: Training steps. The default is small, so that everything takes minutes on two cores.
+        meshes: A folder with a few mesh files, which the packaged model renders too, before anything is trained.
+        first_only: Stop after the page of the packaged model.
+        seed: The seed of the data, the trainings and the evaluation.
+        workers: Processes that train and evaluate side by side, with one thread each. By default one per core, at most
+            four, and one on a GPU. The last digits of fine-tuned scores may differ from those of a single process.
+        quick_check: Only check that everything runs, with a few tiny objects and networks too small to learn.
         device: auto, cpu or cuda.
     """
 
@@ -89,7 +89,7 @@ def settings_of(arguments: Arguments) -> DemoSettings:
         for name in ("objects", "held_out", "resolution", "preset", "steps"):
             if getattr(arguments, name) != getattr(usual, name):
                 option = f"--{name.replace('_', '-')}"
-                raise ValueError(f"{option}: expected none with --quick-check, which has its own; leave it out")
+                raise ValueError(f"{option}: expected none with --quick-check, which sets its own; leave it out")
         small = DemoSettings.quick_check(arguments.seed)
         return replace(small, meshes=arguments.meshes, class_name=arguments.class_name)
     if not 1 < arguments.held_out < arguments.objects:
@@ -105,13 +105,13 @@ def settings_of(arguments: Arguments) -> DemoSettings:
 
 @writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
-    """All steps, each skipped when it is done."""
+    """Do all steps that are not done yet, and print the table."""
     from hyperplanes.experiments.demonstration.steps import Demonstration
 
     console, settings = Console(), settings_of(arguments)
     heading, begun = "", False
 
-    def begin() -> None:  # something of the step is not made yet
+    def begin() -> None:  # called only if something of the step is not done yet
         nonlocal begun
         if not begun:
             console.say(heading)

@@ -1,6 +1,6 @@
-"""Say what works on this machine: torch and its device, the renderers (each is made to draw), lookups, optional parts.
+"""Report what works on this machine: torch and its device, the renderers (each draws), lookups, optional packages.
 
-Ends with exit code 0 when the main job can run, optional parts missing or not, and with 1 when it cannot.
+The exit code is 0 if `hyperplanes demo` can run, even without the optional packages, and 1 if it cannot.
 
 Example:
     hyperplanes doctor
@@ -21,18 +21,18 @@ __all__ = ["Arguments", "line", "run"]
 
 @dataclass(frozen=True)
 class Arguments:
-    """Nothing to choose."""
+    """`doctor` has no options."""
 
 
 def line(check: Check) -> str:
-    """One check for people."""
+    """The line that is printed for a check."""
     mark = "ok    " if check.works else ("BROKEN" if check.needed else "-     ")
     remedy = "" if check.works or not check.remedy else f"; to fix it: {check.remedy}"
     return f"{mark}  {check.name:<26}{check.detail}{remedy}"
 
 
 def run(arguments: Arguments) -> int:
-    """Examine everything and print a line for each."""
+    """Run all checks and print a line for each."""
     from hyperplanes.commands.checks import examine, healthy
 
     console, checks = Console(), examine()

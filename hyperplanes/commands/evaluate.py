@@ -73,7 +73,7 @@ class Arguments:
         boxes: Draw the objects' PSNR here, a box a method.
         steps: Evaluate methods after N fine-tuning steps, a row for each number; 0 is the method itself.
         curve: Draw PSNR over --steps into this file.
-        fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
+        fine_tune: What fine-tuning optimises: the weights theta + delta, or the hypernetwork while theta is frozen.
         seeds: How many seeds.
         lpips: Measure LPIPS with these weights, a safetensors file that `hyperplanes.evaluation.perceptual` describes.
         split: Which objects.

@@ -1,8 +1,8 @@
-"""One object as images, a turntable, a mesh, points, splats and a page to turn it on, from a few posed images of it.
+"""Write one object as images, a turntable, a mesh, points, splats or an HTML page, from a few posed images of it.
 
-The mesh is the surface on which the density crosses a level (marching cubes), as GLB with a texture: Blender, Windows,
-slide shows and three.js open it. The page is one HTML file that a browser opens without anything else: it draws baked
-voxels and turns them with the mouse or a finger.
+The mesh is the surface on which the density crosses a level (marching cubes). By default it is a GLB file with a
+texture, which Blender, Windows, slide shows and three.js open. The page is one HTML file that a browser opens without
+any other file. It draws baked voxels, and the mouse or a finger turns them.
 
 Example:
     hyperplanes export --checkpoint runs/demo --views scene --out chair
@@ -31,26 +31,27 @@ __all__ = ["Arguments", "run"]
 
 @dataclass(frozen=True)
 class Arguments(ObjectArguments):
-    """What to write.
+    """The options of `export`.
 
     Attributes:
-        what: Any of them.
-        frames: Of the turntable.
-        size: Pixels along the longer side of the turntable; as the images when not given.
-        turntable: The format of the turntable; mp4 and webm need `pip install 'hyperplanes[video]'`. Voxels draw it
-            where `render --representation auto` takes them.
-        mesh_format: The format of the mesh: glb has a texture and normals, ply and obj a colour a vertex.
-        faces: Of a mesh with a texture, at most.
-        texture: Pixels along the longer side of the texture, about.
-        voxels: Along each side of the grid that the mesh is cut from.
-        level: Density at the surface, and nothing else; when not given the one whose silhouettes and depth agree best
-            with the rendered ones, and what no shown camera sees into is filled.
-        page_voxels: Along each side of the grid that the page shows and splats are made of; 1.4 a pixel of the images,
-            and at most 256, when not given.
-        fit: Gradient steps that fit these voxels to the shown views, and 1.6 times as many for splats; 0 keeps what the
-            field shows.
-        points: Of the cloud, at most.
-        splat_format: ply, which viewers of Gaussian splats read, or the smaller splat without colour by direction.
+        what: The outputs to write, one or more.
+        frames: Frames of the turntable.
+        size: Pixels along the longer side of the turntable. By default as many as the images have.
+        turntable: The file format of the turntable. mp4 and webm need `pip install 'hyperplanes[video]'`. The turntable
+            is rendered from baked voxels if `render --representation auto` would use them.
+        mesh_format: The file format of the mesh. glb has a texture and normals; ply and obj have a colour per vertex.
+        faces: Most faces of a mesh with a texture.
+        texture: Approximate number of pixels along the longer side of the texture.
+        voxels: Voxels along each side of the grid from which the mesh is extracted.
+        level: Density at the surface of the mesh. By default the level whose silhouettes and depth agree best with the
+            rendered ones; then parts that no camera of a support view sees into are filled as well.
+        page_voxels: Voxels along each side of the grid for the page and the splats. By default 1.4 per pixel of the
+            images, at least 64 and at most 256.
+        fit: Gradient steps that fit these voxels to the support views; splats take 1.6 times as many. With 0, they keep
+            the field's colours and densities.
+        points: Most points of the cloud.
+        splat_format: ply, which viewers of Gaussian splats read, or splat, which is smaller and has no view-dependent
+            colour.
     """
 
     what: tuple[Literal["images", "turntable", "mesh", "page", "splats", "points"], ...] = (
@@ -81,7 +82,7 @@ BELONGS = {
     "points": ("--what points",),
     "splat_format": ("--what splats",),
 }
-"""What options say something of."""
+"""The outputs to which each option applies."""
 
 GOOD_OVERLAP = 0.9
 GOOD_DEPTH = 0.9
@@ -92,7 +93,7 @@ GOOD_DEPTH = 0.9
     check=lambda arguments: refuse_sources(arguments.out / "images", arguments.views),
 )
 def run(arguments: Arguments) -> int:
-    """Adapt and write what was asked for."""
+    """Adapt to the views and write the requested outputs."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.animation import choose_representation
@@ -125,7 +126,7 @@ def run(arguments: Arguments) -> int:
         "--refine-poses": arguments.refine_poses,
         "--page-voxels": arguments.page_voxels is not None,
         "--no-reflections": arguments.no_reflections,
-        # splats are fitted, whatever their voxels come from
+        # splats are fitted even if the voxels are from a baked file
         "--fit": arguments.fit != Arguments.fit and "splats" not in arguments.what,
     }
     refuse_of_baked(source, given)
@@ -136,17 +137,17 @@ def run(arguments: Arguments) -> int:
     made: dict[int, BakedField] = {}
 
     def voxels(adapted: AdaptedField, views: Views, side: int) -> BakedField:
-        if side not in made:  # by the turntable, for the page
+        if side not in made:  # the page uses the voxels of the turntable
             made[side] = bake_field(adapted, views, side, fit=arguments.fit, console=console)
         return made[side]
 
     if "images" in arguments.what:
         paths = save_images(render_views(field, query.cameras, console).images, out / "images", query.names)
-        console.say(f"{out / 'images'}: {len(paths)} pictures of the {_judges(arguments)} poses")
+        console.say(f"{out / 'images'}: {len(paths)} pictures of the {_compared_with(arguments)} poses")
     if "turntable" in arguments.what:
         path = out / f"turntable.{arguments.turntable}"
         cameras = orbit_cameras(shown, arguments.frames, size=arguments.size)
-        # voxels that are not fitted show less than the field
+        # without fitting, voxels show less detail than the field
         drawing = choose_representation(field, shown, cameras, "auto" if arguments.fit else "field", make=voxels)
         pictures = render_views(drawing, cameras, console)
         write_whole(path, encode_animation(to_pixels(pictures.images), arguments.turntable))
@@ -180,23 +181,23 @@ def run(arguments: Arguments) -> int:
 
 
 def _refuse_unused(arguments: Arguments) -> None:
-    """Refuse options that say nothing of what is written."""
+    """Refuse options of outputs that are not written."""
     written = {f"--what {each}" for each in arguments.what}
     if "mesh" in arguments.what:
         written.add(f"--what mesh --mesh-format {arguments.mesh_format}")
     for name, wanted in BELONGS.items():
         given, option = getattr(arguments, name), name.replace("_", "-")
         if given != getattr(Arguments, name) and written.isdisjoint(wanted):
-            raise ValueError(f"--{option}: expected {' or '.join(wanted)}, whose option it is, got {given} without it")
+            raise ValueError(f"--{option}: expected {' or '.join(wanted)} as well, got {given} alone; leave it out")
 
 
-def _judges(arguments: Arguments) -> str:
-    """Which views what is exported is compared with: those that the field was made of, or others."""
-    return "shown" if arguments.all_views else "query"
+def _compared_with(arguments: Arguments) -> str:
+    """The kind of views that the outputs are compared with: "support" with `--all-views`, otherwise "query"."""
+    return "support" if arguments.all_views else "query"
 
 
 def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:
-    """The splats of voxels, with a line on how they look beside them."""
+    """Write the splats of baked voxels, and print the PSNR of both."""
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.splats import STEPS, fit_splats, save_splats, splats_of
     from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
@@ -217,7 +218,7 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
         asked = query[:8].to("cpu")
         pictures = splats.render(asked.cameras), BakedScene(baked).render(asked.cameras).images
         ours, voxels = (float(psnr(part.clamp(0, 1), asked.images).mean()) for part in pictures)
-        quality = f"; {ours:.2f} dB PSNR on {len(asked)} {_judges(arguments)} views, the voxels {voxels:.2f} dB"
+        quality = f"; {ours:.2f} dB PSNR on {len(asked)} {_compared_with(arguments)} views, the voxels {voxels:.2f} dB"
     path = save_splats(splats, arguments.out / f"splats.{arguments.splat_format}")
     console.say(f"{path}: {len(splats.means):,} splats, {path.stat().st_size / 1e6:.1f} MB{quality}")
 
@@ -225,9 +226,9 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
 def _write_mesh(
     solid: AdaptedField, shown: Views, query: Views, arguments: Arguments, console: Console, *, adaptable: bool
 ) -> None:
-    """The mesh, with a line on how it agrees with the field's pictures, and a warning where it does not.
+    """Write the mesh, and print how it agrees with the field's pictures, with a warning if it agrees badly.
 
-    What is not adaptable, a baked file, refuses `--steps`, so that the warning does not advise them.
+    `adaptable` is false for a baked file. That refuses `--steps`, so the warning does not advise them.
     """
     from hyperplanes.export.mesh import density_grid, extract_mesh, save_mesh
     from hyperplanes.export.mesh_filling import fill_hidden
@@ -253,7 +254,7 @@ def _write_mesh(
         console.say(f"{path}: {len(surface.vertices):,} vertices, {len(surface.faces):,} faces")
     found = agreement(surface, solid, query.cameras)
     console.say(
-        f"{path}: its silhouettes overlap the rendered ones of {len(query)} {_judges(arguments)} views by "
+        f"{path}: its silhouettes overlap the rendered ones of {len(query)} {_compared_with(arguments)} views by "
         f"{found.overlap:.1%} (intersection over union), and the depths agree on {found.depth:.1%} of the pixels that "
         f"both cover; density at the surface: {level:.3g}"
     )

@@ -1,4 +1,4 @@
-"""The field that a verb renders: adapted to the views by a model, or read from a baked file."""
+"""Makes the field that a verb renders: a model adapts it to the views, or it is read from a baked file."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 __all__ = ["adapt_to", "bake_field", "load_adaptable", "load_source", "refuse_baked", "refuse_of_baked", "render_views"]
 
 
-WORTH_KEEPING = 5.0  # seconds that adapting took
+WORTH_KEEPING = 5.0  # seconds of adapting above which the field is kept on the disk
 
 
 def load_source(path: Path, device: torch.device, *, reflections: bool = True) -> HyperPlanes | BakedScene:
     """The model of a checkpoint, or the scene of a file that `bake` wrote.
 
     Args:
-        path: a folder, the name of a packaged model, or a file.
-        device: where the model goes; a baked scene is rendered on the CPU.
+        path: a folder, the name of a packaged model, or a baked file.
+        device: the device of the model; a baked scene is rendered on the CPU.
         reflections: as in `load_adaptable`.
     """
     if path.is_file():
@@ -50,8 +50,8 @@ def load_adaptable(path: Path, device: torch.device, *, reflections: bool = True
 
     Args:
         path: a folder, or the name of a packaged model.
-        device: where it goes.
-        reflections: whether it may be shown views of a symmetric object together with their reflections.
+        device: the device of the model.
+        reflections: whether the model may also use reflections of the views of a symmetric object.
     """
     from hyperplanes.adaptation.checkpoints import find_checkpoint
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
@@ -61,10 +61,10 @@ def load_adaptable(path: Path, device: torch.device, *, reflections: bool = True
 
 
 def refuse_baked(path: Path, verb: str) -> None:
-    """One line where a verb that needs a model is given a file.
+    """Refuse a baked file for a verb that needs a model.
 
     Raises:
-        ValueError: a file.
+        ValueError: `path` is a file.
     """
     if path.is_file():
         raise ValueError(
@@ -74,14 +74,14 @@ def refuse_baked(path: Path, verb: str) -> None:
 
 
 def refuse_of_baked(source: HyperPlanes | BakedScene, given: Mapping[str, bool]) -> None:
-    """Refuse options that say how a field is adapted, sampled or baked, of a baked file, which is finished.
+    """Refuse options for adapting, sampling and baking if the source is a baked file, which needs none of these.
 
     Args:
-        source: of `load_source`.
-        given: whether each of some options was given, by its name.
+        source: the result of `load_source`.
+        given: by the name of each such option, whether it was given.
 
     Raises:
-        ValueError: one that was, and a baked file.
+        ValueError: the source is a baked file, and such an option was given.
     """
     from hyperplanes.export.baking import BakedScene
 
@@ -99,18 +99,18 @@ def adapt_to(
     steps: int | Literal["auto"] = 0,
     settings: FineTuning | None = None,
 ) -> tuple[AdaptedField | BakedScene, Sequence[str]]:
-    """The field of one object, with a line on how it was made and warnings where it may not be what was hoped.
+    """The field of one object. It prints how the field was made, and warns if its pictures may be bad.
 
     Args:
-        source: a model, or a baked scene, which is done already.
-        shown: the views of the object.
-        name: of the object.
-        console: where it is said.
+        source: a model, or a baked scene, which is returned as it is.
+        shown: the support views of the object.
+        name: the name of the object.
+        console: prints the messages.
         steps: as in `HyperPlanes.fine_tune`.
         settings: as in `HyperPlanes.fine_tune`.
 
     Returns:
-        The field, and what was warned about before.
+        The field, and the warnings.
     """
     from hyperplanes.adaptation.kept import keep_field, kept_folder, recall_field
     from hyperplanes.adaptation.rotation import RotatedField
@@ -120,7 +120,7 @@ def adapt_to(
     from hyperplanes.export.baking import BakedScene
 
     if isinstance(source, BakedScene):
-        console.say(f"{len(source.field.values):,} baked voxels, shown from the poses of {name}")
+        console.say(f"{len(source.field.values):,} baked voxels, rendered from the poses of {name}")
         return source, []
     warned = suitability_warnings(source, shown, steps)
     for line in warned:
@@ -129,7 +129,7 @@ def adapt_to(
     folder = kept_folder(source, shown, steps, settings)
     kept = recall_field(folder, shown, shown.images.device)
     if kept is not None:
-        console.say(f"{name}: adapted to these {len(shown)} views before, and kept in {folder}")
+        console.say(f"{name}: adapted to these {len(shown)} views before; read from {folder}")
         return kept, warned
     with console.bar("fine-tuning") as bar:
 
@@ -141,7 +141,7 @@ def adapt_to(
                 bar.show(done, steps, "steps")
 
         def count_trials(done: int) -> None:
-            bar.show(done, settings.max_steps, "steps at most, to find how many")
+            bar.show(done, settings.max_steps, "steps at most, to find the best number")
 
         field = source.fine_tune(shown, steps, settings, on_step=count, on_trial=count_trials)
     if time.perf_counter() - started > WORTH_KEEPING:
@@ -165,13 +165,13 @@ def adapt_to(
 def render_views(
     field: Renderable, cameras: PinholeCamera, console: Console, sampling: Sampler | None = None
 ) -> Pictures:
-    """The pictures of cameras, one after the other, with a progress line.
+    """The pictures of cameras, rendered one after the other, with a progress line.
 
     Args:
-        field: what is seen.
-        cameras: any number.
-        console: where the progress is shown.
-        sampling: another sampler than the field's own, for one that was adapted.
+        field: the field to render.
+        cameras: any number of cameras.
+        console: shows the progress.
+        sampling: the sampler of an adapted field; by default the field's own.
     """
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.geometry import cameras as camera
@@ -199,12 +199,12 @@ def bake_field(
     """The voxels of a field, fitted to the views that it was adapted to, with progress lines.
 
     Args:
-        field: what is baked.
+        field: the field to bake.
         shown: its support views.
-        side: voxels an axis.
+        side: voxels along each axis.
         fit: gradient steps on the views; 0 keeps the field's own colours and densities.
-        console: where the progress is shown, and at the end what it cost.
-        check: called now and then; what it raises ends the work.
+        console: shows the progress, and at the end the number of voxels and the time.
+        check: called after each part of the work; it may raise to end the work.
     """
     from hyperplanes.export.baking import bake
     from hyperplanes.export.voxel_fitting import fit_voxels, render_guide

@@ -1,4 +1,4 @@
-"""Options that several verbs share, and how optional ones look in their help."""
+"""Options that several verbs share, and how options with the default None are shown in the help."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 
 
 def optional(metavar: str, **options: Any) -> Any:
-    """What tyro is told of an option that may be left out: no {None}, no (default: None)."""
+    """The annotation for tyro of an option with the default None: the help shows no {None} and no (default: None)."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="", **options)
 
 
@@ -41,32 +41,33 @@ Protocol = Literal["default", "paper", "ray_marching"]
 """A name in `hyperplanes.configuration.presets.PROTOCOLS`."""
 
 Steps = int | Literal["auto"]
-"""Fine-tuning steps, or as many as show left-out views best."""
+"""A number of fine-tuning steps, or "auto" for the number that is best for held-out views."""
 
 Free = Literal["weights", "hypernetwork"]
 """What fine-tuning optimises."""
 
 MOST_FRAMES = 10_000
-"""Of an orbit."""
+"""Most frames of an orbit."""
 
 ViewsUp = Annotated[str, tyro.conf.arg(metavar="{auto,y,z,x,-y,-z,-x}")]
-"""The axis that points up in the world of photographs, three numbers, or auto: from how the cameras are held."""
+"""The direction that points up in the world of the views: an axis, three numbers, or auto, as in `read_scene`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewsArguments:
-    """How views are read, and what is done with them before anything adapts to them.
+    """Options for reading views and preparing them before a model adapts to them.
 
     Attributes:
-        learn_background: For photographs without masks: fit the object (the sphere at the centre of the scene) and the
-            background together, and take what the object covers as masks.
-        refine_poses: Refine the poses of all views first, and keep them where support views that the model is not given
-            are shown better by half a decibel: for poses that are a little wrong.
-        no_reflections: Do not show the model the mirror images of the views of an object that looks symmetric.
+        learn_background: For photographs without masks: fit the object, in the sphere at the centre of the scene, and
+            the background together, and use the pixels that the object covers as masks.
+        refine_poses: For poses that are slightly wrong: refine the poses of all views first. The refined poses are used
+            if they raise the PSNR of held-out support views by 0.5 dB or more.
+        no_reflections: Do not give the model mirror images of the views of an object that looks symmetric.
         up: The direction that points up in the world of the views: an axis such as y or -z, three numbers such as
-            0,0.1,1, or auto: from how the cameras are held. Meshes, turntables and baked files have y up.
-        downscale: Reduce the images by this factor, averaging pixels. When not given, images of more than a megapixel
-            are reduced to at most one.
+            0,0.1,1, or auto. auto takes what the files state, or else guesses it from how the cameras are held.
+            Meshes, turntables and baked files have y up.
+        downscale: Reduce the images by this factor, averaging pixels. By default, images of more than a megapixel are
+            reduced to at most one.
         device: auto, cpu or cuda.
     """
 
@@ -80,17 +81,17 @@ class ViewsArguments:
 
 @dataclass(frozen=True)
 class ObjectArguments(ViewsArguments):
-    """What the verbs of one object share: a model, the views that it is shown, and how they are read.
+    """Options of the verbs for one object: a model, the views that it is given, and how they are read.
 
     Attributes:
-        checkpoint: What `train`, `adapt` or `demo` wrote, or a packaged model: small, small-paper, cars-64. A file that
-            `bake` wrote is taken by `render` and `export`.
-        views: The posed images of the object; example-car comes with the package.
+        checkpoint: A folder that `train`, `adapt` or `demo` wrote, or a packaged model: small, small-paper, cars-64.
+            `render` and `export` also take a file that `bake` wrote.
+        views: The posed images of the object. example-car comes with the package.
         out: The folder to write to; for `bake`, the file.
-        steps: Fine-tuning steps on the shown views, or auto: as many as show left-out ones best. 0 is the paper's
-            single forward pass.
-        all_views: Give the model all views. By default it gets every other one, the support views, and its pictures are
-            compared with the rest.
+        steps: Fine-tuning steps on the support views, or auto for the number that is best for held-out views. 0 is the
+            paper's single forward pass.
+        all_views: Give the model all views. By default it is given every other view, the support views, and its
+            pictures are compared with the rest.
     """
 
     checkpoint: Path
@@ -101,34 +102,34 @@ class ObjectArguments(ViewsArguments):
 
 
 def check_fine_tune(chosen: str, steps: int | str) -> None:
-    """Refuse a choice of what fine-tuning optimises where there is none.
+    """Refuse a choice of what fine-tuning optimises if there is no fine-tuning.
 
     Args:
-        chosen: of `--fine-tune`.
-        steps: of fine-tuning.
+        chosen: the value of `--fine-tune`.
+        steps: the number of fine-tuning steps.
 
     Raises:
-        ValueError: a choice, and no step.
+        ValueError: a value other than the default, and no steps.
     """
     if chosen != "weights" and steps == 0:
-        raise ValueError(f"--fine-tune: expected --steps, which optimise so, got {chosen} alone; add a number of steps")
+        raise ValueError(f"--fine-tune: expected --steps as well, got {chosen} alone; add a number of steps")
 
 
 def check_orbit(orbit: int | None, size: int | None, *others: str) -> None:
-    """Refuse frames and pixels of an orbit that cannot be rendered.
+    """Refuse a number of frames or a size that an orbit cannot have.
 
     Args:
-        orbit: frames around the object, None for no orbit.
-        size: pixels along the longer side of its pictures, None for that of the images.
-        others: options beside --orbit whose pictures may have that size.
+        orbit: number of frames around the object; None for no orbit.
+        size: pixels along the longer side of the frames; None for the size of the images.
+        others: further options, besides --orbit, to which the size applies.
 
     Raises:
-        ValueError: no frame or too many, no pixel, or a size of no orbit.
+        ValueError: no frames or too many, no pixels, or a size without an orbit.
     """
     if orbit is not None and not 1 <= orbit <= MOST_FRAMES:
         raise ValueError(f"--orbit: expected 1 to {MOST_FRAMES} frames, got {orbit}")
     if size is not None and orbit is None:
         those = " or ".join(["--orbit", *others])
-        raise ValueError(f"--size: expected {those}, whose pictures it is for, got {size} without; leave it out")
+        raise ValueError(f"--size: expected {those} as well, got {size} alone; leave it out")
     if size is not None and size < 1:
         raise ValueError(f"--size: expected at least 1 pixel, got {size}")

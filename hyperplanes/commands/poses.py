@@ -1,4 +1,4 @@
-"""Poses refined before a verb adapts to the views, where that is worth it."""
+"""Refines poses before a verb adapts to the views, and keeps them if they are better."""
 
 from __future__ import annotations
 
@@ -19,30 +19,39 @@ if TYPE_CHECKING:
 
 __all__ = ["refine_task"]
 
-JUDGED = 128  # pixels along the longer side of the views that are shown to compare poses
-LEAST_GAIN = 0.5  # decibels; four views say no more, and right poses become a little worse
+COMPARED_SIZE = 128  # pixels along the longer side of the support views when poses are compared
+LEAST_GAIN = 0.5  # dB: four held-out views cannot measure less, and refining makes correct poses slightly worse
 
 
 def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views: bool = False) -> Task:
-    """The views with refined poses, or as they are where a field of the refined ones shows left-out views no better.
+    """The task with refined poses, or unchanged if these do not raise the PSNR of held-out support views enough.
 
-    Support and query are refined together; only support views decide which poses are taken. What was found is kept
-    (`adaptation.kept`), so that another command on the same views does not search again.
+    The poses of support and query views are refined together. Only support views decide which poses are used. The
+    result is kept on the disk (`adaptation.kept`), so that another command on the same views does not compute it again.
 
     Args:
         source: the model that will adapt.
-        task: the views to show and those to ask for.
-        console: where it is said.
-        all_views: both are the same.
+        task: the support and the query views.
+        console: prints the result.
+        all_views: whether support and query views are the same.
 
-    Too few views are a ValueError.
+    Returns:
+        The task.
+
+    Raises:
+        ValueError: too few views, in all or as support.
     """
     from hyperplanes.adaptation.kept import keep_tensors, kept_file, recall_tensors
-    from hyperplanes.evaluation.suitability import HELD_OUT_SIZE
+    from hyperplanes.evaluation.suitability import FEWEST_VIEWS, HELD_OUT_SIZE
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.views import Task, join_views
 
     count, started = len(task.support), time.perf_counter()
+    if count < FEWEST_VIEWS:
+        raise ValueError(
+            f"--refine-poses: expected at least {FEWEST_VIEWS} support views to compare refined poses with the given "
+            f"ones, got {count}"
+        )
     views = task.support if all_views else join_views(task.support, task.query)
     file = kept_file("poses", views, source, count)
     found = recall_tensors(file, ("extrinsics", "turned", "psnr"))
@@ -52,10 +61,10 @@ def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views:
         how = format_duration(time.perf_counter() - started)
         keep_if_possible(file, partial(keep_tensors, file, found), console)
     before, after = found["psnr"].tolist()
-    figures = f"support views left out have {after:.2f} dB with them, {before:.2f} as given"
+    figures = f"held-out support views have {after:.2f} dB with the refined poses, {before:.2f} with the given ones"
     figures += f" ({HELD_OUT_SIZE} pixels); {how}"
     if after < before + LEAST_GAIN:
-        console.say(f"poses: as given, refined ones are not better by {LEAST_GAIN:g} dB: {figures}")
+        console.say(f"poses: as given, because refined poses are not better by {LEAST_GAIN:g} dB: {figures}")
         return task
     turned = found["turned"]
     console.say(
@@ -68,9 +77,10 @@ def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views:
 
 
 def _refined(source: HyperPlanes, views: Views, count: int, console: Console) -> dict[str, Tensor]:
-    """What is kept of a refinement: poses, by how much they turned, and what the first `count` views say of them.
+    """The tensors of a refinement that are kept.
 
-    The latter is the PSNR in decibels of those of them that are left out, with the given poses and with the refined.
+    They are "extrinsics" (view, 4, 4); "turned", the degrees by which each camera rotated about the centre of the
+    scene; and "psnr" in dB, of held-out views among the first `count`, with the given and with the refined poses.
     """
     import torch
 
@@ -80,8 +90,13 @@ def _refined(source: HyperPlanes, views: Views, count: int, console: Console) ->
 
     with console.bar("refining poses") as bar:
         found = refine_poses(views, on_step=lambda done, total: bar.show(done, total, "steps"))
-    judged = [
-        held_out_psnr(source, each[:count].resized(JUDGED).to(source.rig.device)) for each in (views, found.views)
-    ]
-    values = torch.tensor([each[0] if each is not None else 0.0 for each in judged])
-    return {"extrinsics": camera.camera_from_world(found.views.cameras), "turned": found.turned, "psnr": values}
+    values = []
+    for each in (views, found.views):
+        compared = held_out_psnr(source, each[:count].resized(COMPARED_SIZE).to(source.rig.device))
+        assert compared is not None
+        values.append(compared[0])
+    return {
+        "extrinsics": camera.camera_from_world(found.views.cameras),
+        "turned": found.turned,
+        "psnr": torch.tensor(values),
+    }

@@ -1,4 +1,4 @@
-"""List the named configurations that `train --preset` knows, or print all settings of one as YAML.
+"""List the named configurations that `train --preset` accepts, or print all settings of one as YAML.
 
 Example:
     hyperplanes presets
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 __all__ = ["HEADINGS", "Arguments", "row", "run"]
 
-HEADINGS = ("preset", "pixels", "network", "encoder", "shown", "sampling", "steps", "rays a step")
+HEADINGS = ("preset", "pixels", "network", "encoder", "views read", "sampling", "steps", "rays a step")
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Which preset.
+    """The options of `presets`.
 
     Attributes:
-        name: Print all settings of this one.
+        name: The preset whose settings are printed. By default all presets are listed.
     """
 
     name: tyro.conf.Positional[Annotated[str | None, optional("[NAME]")]] = None
@@ -40,8 +40,8 @@ def row(name: str, preset: Preset) -> tuple[str, ...]:
     from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 
     model, training = preset.model, preset.training
-    hyper, anyhow = model.hypernetwork, find_targets()[model.target].permutation_invariant
-    planes = "any" if anyhow else model.network.planes
+    hyper, any_views = model.hypernetwork, find_targets()[model.target].permutation_invariant
+    planes = "any" if any_views else model.network.planes
     images = hyper if isinstance(hyper, ImageHyperNetworkConfig) else None
     read = f"{images.views if images else 0} of {planes}"
     return (
@@ -57,7 +57,7 @@ def row(name: str, preset: Preset) -> tuple[str, ...]:
 
 
 def run(arguments: Arguments) -> int:
-    """Print the table, or one of its rows in full."""
+    """Print the table of presets, or all settings of one."""
     from hyperplanes.configuration.presets import PRESETS, preset
     from hyperplanes.configuration.settings_file import document
 

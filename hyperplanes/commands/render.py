@@ -1,9 +1,10 @@
-"""New views of one object from a few posed images: one forward pass of a model, and gradient steps with --steps.
+"""Render new views of one object from a few posed images: one forward pass of a model, and gradient steps with --steps.
 
-The images come as a folder with transforms.json (Blender's, nerfstudio's), a COLMAP model, what Polycam, Record3D,
-KIRI Engine, RealityCapture or Metashape export, a scene of LLFF, IDR or NSVF, or an object of any data set. The model
-is shown the support half of the views and asked for the other half, so that the result can be compared with the truth;
---orbit asks for a full turn around the object instead, --camera-path for the frames of a path of nerfstudio's viewer.
+The images are a folder with transforms.json (of Blender or nerfstudio), a COLMAP model, an export of Polycam, Record3D,
+KIRI Engine, RealityCapture or Metashape, a scene of LLFF, IDR or NSVF, or an object of any data set. By default the
+model is given half of the views, the support views, and renders the other half, so that the pictures can be compared
+with the images. --orbit renders a full turn around the object instead, and --camera-path the frames of a camera path of
+nerfstudio's viewer.
 
 Example:
     hyperplanes render --checkpoint small --views example-car --out new-views
@@ -46,32 +47,33 @@ if TYPE_CHECKING:
 
 __all__ = ["Arguments", "run"]
 
-LARGEST_ORBIT = 400  # pixels of an orbit's pictures where none were asked for: time grows with their square
+LARGEST_ORBIT = 400  # most pixels along the longer side of an orbit without --size: time grows with their square
 ROUND = 4.0  # seconds of a turntable
 
 
 @dataclass(frozen=True)
 class Arguments(ObjectArguments):
-    """What to look at, and from where.
+    """The options of `render`.
 
     Attributes:
-        fine_tune: What fine-tuning optimises: theta + delta itself, or the hypernetwork with theta frozen.
-        orbit: This many pictures evenly around the object, and a turntable, instead of the query poses.
-        camera_path: A JSON of nerfstudio's viewer or Blender add-on: the pictures of its frames, and an animation.
-        dataparser_transforms: nerfstudio's dataparser_transforms.json, where the path was made in its viewer: from the
-            world of the views to that of the path.
-        rendered_output_names: What is drawn: rgb, depth (16 bits, along the optical axis), normals, accumulation
-            (opacity); all but rgb into folders of their names.
-        size: Pixels along the longer side of the pictures of an orbit or a path; of an orbit as the images, but 400 at
-            most, when not given.
-        turntable: The format of the animation; mp4 and webm need `pip install 'hyperplanes[video]'`.
-        representation: What draws the pictures: the field itself, or voxels that are baked from it and fitted to the
-            shown views, which takes half a minute once and milliseconds a picture. auto takes voxels for an orbit or
-            a path of enough pictures for this to be faster, where 16 views or more are shown.
-        residuals: Add to the pictures what the field lacks where the shown views see the same places. All shown views
-            are rendered for that first. auto: where the model does so, `small` from 10 views on, unless they are large.
-        protocol: How the field is sampled: as it was trained, 64 + 128 times a ray as in the paper, or by ray
-            marching through what is not empty.
+        fine_tune: What fine-tuning optimises: the weights theta + delta, or the hypernetwork while theta is frozen.
+        orbit: Render this many pictures evenly around the object, and a turntable, instead of the query views.
+        camera_path: A JSON file of nerfstudio's viewer or Blender add-on. Its frames are rendered, and an animation.
+        dataparser_transforms: nerfstudio's dataparser_transforms.json, for a path that was made in its viewer. It
+            transforms the world of the views to that of the path.
+        rendered_output_names: The outputs: rgb, depth (16 bits, along the optical axis), normals, accumulation
+            (opacity). All but rgb are written to folders of their names.
+        size: Pixels along the longer side of the pictures of an orbit or a camera path. By default, an orbit has the
+            size of the images, but at most 400 pixels, and a path the size in its file.
+        turntable: The file format of the animation. mp4 and webm need `pip install 'hyperplanes[video]'`.
+        representation: What is rendered: the field, or voxels that are baked from it and fitted to the support views.
+            Voxels take half a minute once, and then milliseconds a picture. auto uses voxels for an orbit or a camera
+            path if that is faster for all its pictures and there are at least 16 support views.
+        residuals: Add the differences between the support views and their renderings to the pictures, at places that
+            both see. This renders all support views first. auto: as the model is configured; `small` does so with at
+            least 10 views that are not large.
+        protocol: How the field is sampled: default, as in training; paper, 64 + 128 samples on each ray; or
+            ray_marching, which takes samples only in the visual hull.
     """
 
     fine_tune: Free = "weights"
@@ -88,13 +90,12 @@ class Arguments(ObjectArguments):
 
 @dataclass(frozen=True)
 class Asked:
-    """What is rendered.
+    """The pictures to render.
 
     Attributes:
-        cameras: one a picture.
-        names: of the pictures.
-        animation: the name of a file for all of them, and the seconds that it lasts; None for poses whose pictures are
-            known.
+        cameras: one camera per picture.
+        names: the names of the pictures.
+        animation: the name of the file of an animation, and its duration in seconds; None for the query views.
     """
 
     cameras: PinholeCamera
@@ -104,7 +105,7 @@ class Asked:
 
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
-    """Adapt, render, write, and say how well it went where the truth is known."""
+    """Adapt, render, write the pictures, and print their PSNR if the true images are known."""
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.adaptation.residuals import CorrectedField, ResidualField
     from hyperplanes.configuration.fine_tuning import FineTuning
@@ -149,7 +150,7 @@ def run(arguments: Arguments) -> int:
     corrected = isinstance(residuals, ResidualField)
     if corrected:
         with console.bar("residuals") as bar:
-            residuals.prepare(lambda done: bar.show(done, len(shown), "shown views"))
+            residuals.prepare(lambda done: bar.show(done, len(shown), "support views"))
     started = time.perf_counter()
     pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / asked.cameras.batch_size
@@ -165,14 +166,14 @@ def run(arguments: Arguments) -> int:
             path = (arguments.out if output == "rgb" else arguments.out / output) / f"{name}.{arguments.turntable}"
             frames = output_frames(output, pictures, asked.cameras)
             write_whole(path, encode_animation(frames, arguments.turntable, lasting))
-            console.say(f"{path}: {lasting:.3g} seconds of them")
+            console.say(f"{path}: an animation of {lasting:.3g} seconds")
     if scores is None and not isinstance(source, BakedScene) and (arguments.steps == 0 or warned):
         scores = held_out_psnr(source, shown)
         if scores is not None:
             without = " and residuals" if corrected else ""
             console.say(
-                f"without fine-tuning{without}, on support views left out for this: {scores[0]:.2f} dB PSNR, "
-                f"copying the nearest view {scores[1]:.2f} dB"
+                f"without fine-tuning{without}, on held-out support views: {scores[0]:.2f} dB PSNR; "
+                f"copying the nearest view has {scores[1]:.2f} dB"
             )
             scores = scores if arguments.steps == 0 else None
     steps = None if isinstance(source, BakedScene) else arguments.steps
@@ -186,7 +187,7 @@ def run(arguments: Arguments) -> int:
 
 
 def _representation(arguments: Arguments, asked: Asked) -> Representation:
-    """What draws the pictures: as told, and by default the field, but for the colours of animations."""
+    """The representation that is passed on: "auto" becomes "field", except for animations with the rgb output alone."""
     colours_alone = set(arguments.rendered_output_names) == {"rgb"} and arguments.protocol == "default"
     if arguments.representation == "auto" and (asked.animation is None or not colours_alone):
         return "field"
@@ -194,7 +195,7 @@ def _representation(arguments: Arguments, asked: Asked) -> Representation:
 
 
 def _check(arguments: Arguments) -> None:
-    """Refuse options of a camera path or an orbit that say nothing together, or cannot be encoded here."""
+    """Refuse options that cannot be combined, and formats of animations that cannot be encoded on this machine."""
     from hyperplanes.export.images import require_encoder
 
     if arguments.camera_path is not None or arguments.orbit is not None:
@@ -203,23 +204,21 @@ def _check(arguments: Arguments) -> None:
         raise ValueError("--rendered-output-names: expected at least one of rgb, depth, normals and others, got none")
     if arguments.turntable != "webp" and arguments.orbit is None and arguments.camera_path is None:
         raise ValueError(
-            f"--turntable: expected --orbit or --camera-path, whose animation it is of, got {arguments.turntable} alone"
+            f"--turntable: expected --orbit or --camera-path as well, got {arguments.turntable} alone; add one of them"
         )
     if arguments.representation == "voxels" and arguments.protocol != "default":
         raise ValueError(
-            "--protocol: expected none with --representation voxels, which are not sampled so; leave one out"
+            "--protocol: expected none with --representation voxels, because only fields have one; leave one out"
         )
     if arguments.residuals == "on" and arguments.protocol != "default":
         raise ValueError(
-            f"--protocol: expected none with --residuals on, which are of the field as it was trained, got "
+            f"--protocol: expected none with --residuals on, which are computed with the protocol of training, got "
             f"{arguments.protocol}; leave one out"
         )
     if arguments.camera_path is None:
         check_orbit(arguments.orbit, arguments.size, "--camera-path")
         if arguments.dataparser_transforms is not None:
-            raise ValueError(
-                "--dataparser-transforms: expected --camera-path, whose world it is of, got none; name one"
-            )
+            raise ValueError("--dataparser-transforms: expected --camera-path as well, got none; name a camera path")
         return
     if arguments.orbit is not None:
         raise ValueError("--camera-path, --orbit: expected one of them, got both; leave one out")
@@ -228,7 +227,7 @@ def _check(arguments: Arguments) -> None:
 
 
 def _asked(arguments: Arguments, shown: Views, known: Views, up: str, console: Console) -> Asked:
-    """The cameras of a path, of an orbit, or of the query views."""
+    """The cameras of a camera path, of an orbit, or of the query views."""
     from hyperplanes.export.images import orbit_cameras
 
     if arguments.camera_path is not None:
@@ -244,9 +243,10 @@ def _asked(arguments: Arguments, shown: Views, known: Views, up: str, console: C
 def _compared(
     pictures: Pictures, shown: Views, known: Views, all_views: bool, finished: bool, console: Console
 ) -> tuple[float, float] | None:
-    """The mean PSNR of pictures and of the nearest views, where the model was not shown what they are compared to.
+    """Print PSNR and SSIM of the pictures; returns the mean PSNR of the pictures and of the nearest support views.
 
-    What was finished before, a baked file or the weights of one object, does not say which views it was made of.
+    The result is None if the model was given the views that are compared. `finished` is true for a baked file and for
+    the weights of one object, which do not record the views that they were made from.
     """
     from hyperplanes.adaptation.nearest_view import NearestView
     from hyperplanes.utilities.metrics import psnr, ssim
@@ -256,8 +256,8 @@ def _compared(
     quality = f"{value:.2f} dB PSNR"
     if min(known.size) >= 11:
         quality += f", {float(ssim(images, known.images).mean()):.3f} SSIM"
-    now = "not shown now, but perhaps before" if finished else "never shown to the model"
-    how = "shown to the model as well" if all_views else now
+    now = "not given now, but perhaps when it was adapted" if finished else "not given to the model"
+    how = "given to the model as well" if all_views else now
     console.say(f"against the {len(known)} true views, {how}: {quality}")
     if all_views:
         return None

@@ -1,11 +1,11 @@
-"""Run a table or a figure of the HyperPlanes paper and print it beside the paper's numbers.
+"""Reproduce a table or a figure of the HyperPlanes paper and print it beside the paper's numbers.
 
-The scale `smoke` takes seconds and shows that everything runs; `small` makes all ten tables in some hours on one core,
-on procedural objects of 32x32 pixels that `hyperplanes generate` makes; `gpu` is sized for all ten in about a day
-on one card, and `paper` is the paper's setting, both on data sets as they were published, one folder a class. These two
-say first how long they will take by what they have measured here, as --estimate does for any. All tables share --out: a
-data set, a training or an evaluation that lies there is not made again, so Ctrl-C and the same command go on. The table
-goes to --out/NAME as Markdown, CSV and JSON with its figures.
+The scale `smoke` takes seconds and shows that everything runs. `small` makes all ten tables in some hours on one core,
+with procedural objects of 32x32 pixels from `hyperplanes generate`. `gpu` is sized for all ten in about a day on one
+GPU, and `paper` has the paper's settings. Both need the published data sets, one folder per class, and first print how
+long they will take, from steps measured on this machine; --estimate does so for any scale. All tables share --out, and
+no data set, training or evaluation there is made twice. To resume after Ctrl-C, run the same command again. The table
+is written to --out/NAME as Markdown, CSV and JSON, with its figures.
 
 Example:
     hyperplanes reproduce target --scale smoke
@@ -37,26 +37,26 @@ if TYPE_CHECKING:
 __all__ = ["Arguments", "data_sets", "run"]
 
 BROUGHT = {"Tables": "hyperplanes.tables"}
-"""Groups of entry points whose names are tables."""
+"""Groups of entry points whose names are tables, by their heading in the help."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Which table, how large, and where to.
+    """The options of `reproduce`.
 
     Attributes:
         name: The table or figure of the paper: shapenet, cross-class, target, time, single-class, iterations,
             hyperplanes, imageplanes, inputs or layers; or a table of another installed package.
-        scale: How large.
-        out: The folder for data, trainings, evaluations and tables, shared by all of them.
-        data: Data sets by class, such as car=FOLDER, in any layout; what is not given is generated.
-        only: Rows and columns by their headings, such as Cars; all where empty.
-        seeds: Other than the scale's: seeds of trainings and of the fine-tuning of their evaluations.
-        legacy: Read the principal points of published data at W / 2 at integer pixel centres, as the code published
-            with them has it.
-        workers: Processes that train and evaluate side by side, with one thread each, by which fine-tuned scores may
-            differ in their last digits from those of one process; times are measured by one alone.
-        estimate: Only measure a few steps of every training and say how long all will take here.
+        scale: The scale of the experiment: the size of data and models, and the number of steps and seeds.
+        out: The folder for data, trainings, evaluations and tables. All tables share it.
+        data: Data sets by class, such as car=FOLDER, in any layout. Classes that are not given are generated.
+        only: Run only the rows and columns with these headings, such as Cars. By default all of them.
+        seeds: The number of seeds. A seed is used for a training and for the fine-tuning of its evaluations. By default
+            that of the scale.
+        legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.
+        workers: Processes that train and evaluate side by side, with one thread each. The last digits of fine-tuned
+            scores may differ from those of a single process. Times are always measured by one process alone.
+        estimate: Only measure a few steps of every training, and print how long everything will take on this machine.
         device: auto, cpu or cuda.
     """
 
@@ -73,14 +73,14 @@ class Arguments:
 
 
 def data_sets(given: Sequence[str], classes: Collection[str]) -> dict[str, Path]:
-    """Folders by class.
+    """The folders of data sets by class.
 
     Args:
-        given: of the form CLASS=FOLDER.
-        classes: those that there are.
+        given: strings of the form CLASS=FOLDER.
+        classes: the known classes.
 
     Raises:
-        ValueError: not of that form, another class, or one class twice.
+        ValueError: another form, an unknown class, or one class twice.
     """
     found: dict[str, Path] = {}
     for each in given:
@@ -94,7 +94,7 @@ def data_sets(given: Sequence[str], classes: Collection[str]) -> dict[str, Path]
 
 @writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
-    """Run what is not done yet and print the table."""
+    """Run everything that is not done yet and print the table."""
     from hyperplanes.experiments import SCALES, find_experiment, report
     from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
     from hyperplanes.experiments.estimate import estimate

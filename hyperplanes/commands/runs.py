@@ -1,4 +1,4 @@
-"""The engine of experiments with what a person sees of it: data by `generate`, trainings with a progress line."""
+"""Makes the runner of experiments for `demo` and `reproduce`: it generates data and shows the progress of trainings."""
 
 from __future__ import annotations
 
@@ -20,11 +20,15 @@ if TYPE_CHECKING:
 __all__ = ["count_workers", "make_runner", "make_workers"]
 
 MOST = 4
-"""Workers where nobody says how many: each holds the data set that it trains on."""
+"""Most workers by default, because each holds the data set that it trains on in memory."""
 
 
 def count_workers(asked: int | None, device: str) -> int:
-    """As many as asked for; where nobody says, one a core, at most MOST, and one alone on a GPU."""
+    """The requested number of workers; by default one per core, at most MOST, and a single one on a GPU.
+
+    Raises:
+        ValueError: less than one worker.
+    """
     from hyperplanes.data.devices import choose_device
     from hyperplanes.utilities.environment import usable_cores
 
@@ -36,13 +40,13 @@ def count_workers(asked: int | None, device: str) -> int:
 
 
 def make_workers(count: int, out: Path, scale: Scale, device: str, **given: Any) -> Workers | None:
-    """Processes for the runner of a folder, a context; None for a single one, whose work this process does.
+    """A context with processes for the runner of a folder; None if `count` is 1, since this process then does the work.
 
     Args:
-        count: of processes.
+        count: number of processes.
         out: the folder of the workspace.
-        scale: how large.
-        device: auto, or the name of one.
+        scale: the scale of the experiment.
+        device: auto, or the name of a device.
         given: as in `make_runner`.
     """
     from hyperplanes.experiments.workers import Workers
@@ -51,7 +55,7 @@ def make_workers(count: int, out: Path, scale: Scale, device: str, **given: Any)
 
 
 def _worker_runner(out: Path, scale: Scale, device: str, **given: Any) -> Runner:
-    """The runner of a worker process, which is told of generated data sets with its work."""
+    """The runner of a worker process. It gets the folders of generated data sets with each piece of work."""
     from hyperplanes.commands.console import Console
     from hyperplanes.experiments.workspace import Workspace
 
@@ -69,16 +73,16 @@ def make_runner(
     workers: Workers | None = None,
     **given: Any,
 ) -> Runner:
-    """A runner that generates, trains and says how it goes.
+    """A runner that generates data sets, trains models, and shows the progress.
 
     Args:
-        workspace: the folder for everything.
-        scale: how large.
-        console: where it is said.
-        device: auto, or the name of one.
-        announce: called with a line before a training.
+        workspace: the folder for all results.
+        scale: the scale of the experiment.
+        console: shows the progress.
+        device: auto, or the name of a device.
+        announce: called with a line before each training.
         workers: as in `Runner`.
-        given: of `DataSets`: which are given, and how they are read.
+        given: further arguments of `DataSets`: the given data sets, and how they are read.
     """
     from hyperplanes.commands import find_verb
     from hyperplanes.commands.train import follow
@@ -92,7 +96,7 @@ def make_runner(
     def generate(settings: Mapping[str, Any], folder: Path) -> None:
         verb, named = find_verb("generate").load(), dict(settings)
         class_name, count = named.pop("class"), named.pop("objects")
-        named.pop("contents", None)  # tells the data set from one of other meshes in the same folder
+        named.pop("contents", None)  # only identifies the data set: it changes if the meshes in the folder change
         objects = {} if "meshes" in named else {"class_name": class_name, "count": count}
         verb.run(verb.Arguments(folder, **objects, **named))
 
@@ -101,7 +105,7 @@ def make_runner(
         announce(f"training {trained.method} on {trained.on}, seed {config.seed}, {config.steps:,} steps: {folder}")
         trainer = start_training(chosen.model, config, data, folder, where, reference)
         if trainer.step:
-            console.say(f"going on from step {trainer.step}")
+            console.say(f"resuming from step {trainer.step}")
         with console.bar(trained.method) as bar:
             follow(trainer, bar)
 

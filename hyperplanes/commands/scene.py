@@ -1,4 +1,4 @@
-"""The posed images that a verb is given: read, turned upright, and what there is to say about them."""
+"""Reads the posed images that a verb is given, and rotates their world so that y is up."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ __all__ = ["prepare_task", "read_object", "read_path", "read_scene", "refuse_sou
 
 
 def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, console: Console) -> tuple[Task, str]:
-    """As `read_scene`, of the options that the verbs of one object share.
+    """As `read_scene`, with the options that the verbs for one object share.
 
-    The background is learned and poses are refined where that is asked for.
+    If requested, the background is learned and the poses are refined.
 
     Args:
         arguments: the options.
-        source: what will adapt to the views.
-        console: where it is said.
+        source: the model that will adapt to the views, or a baked scene.
+        console: prints messages.
     """
     task, up = read_scene(
         arguments.views,
@@ -45,14 +45,14 @@ def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, co
 def prepare_task(
     arguments: ViewsArguments, task: Task, source: HyperPlanes | BakedScene, console: Console, *, all_views: bool
 ) -> Task:
-    """Views whose background is learned and whose poses are refined, where that is asked for.
+    """The task, with a learned background and refined poses if these are requested.
 
     Args:
-        arguments: what is asked for.
-        task: the views to show and those to ask for.
-        source: what will adapt to them.
-        console: where it is said.
-        all_views: both are the same.
+        arguments: the options.
+        task: the support and the query views.
+        source: the model that will adapt to the views, or a baked scene.
+        console: prints messages.
+        all_views: whether support and query views are the same.
     """
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.background import cut_out_task
@@ -69,19 +69,20 @@ def prepare_task(
 def read_scene(
     path: Path, console: Console, *, all_views: bool = False, up: str = "auto", downscale: int | None = None
 ) -> tuple[Task, str]:
-    """The views to show and the views to ask for; the same ones where all are shown.
+    """The support and the query views of a scene; with `all_views`, both are all views.
 
-    What was left out, turned or scaled is a warning; which way is up, where it was guessed, a line.
+    It warns of images that were left out, rotated or scaled, and prints the up direction if `up` is "auto".
 
     Args:
-        path: of the posed images, or the name of a scene that comes with the package.
-        console: where it is said.
-        all_views: whether all are shown.
-        up: the direction that points up in their world, as in `y_up_from`, or auto: from how the cameras are held.
+        path: the posed images, or the name of a scene that comes with the package.
+        console: prints messages.
+        all_views: whether all views are support views.
+        up: the direction that points up in the world of the files, as in `y_up_from`, or "auto": the direction that the
+            files state, or else a guess from how the cameras are held.
         downscale: as in `read_views`.
 
     Returns:
-        Views of a world with y up, and the direction that was up before.
+        The task in a world with y up, and the direction that was up before.
     """
     from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.formats.recognise import read_posed, read_posed_task, scene_name
@@ -108,18 +109,18 @@ def read_scene(
 def read_path(
     path: Path, transforms: Path | None, size: int | None, shown: Views, up: str, scene: Path, console: Console
 ) -> tuple[PinholeCamera, float]:
-    """The cameras of a camera path in the world of the views that the model is shown, and the seconds of its video.
+    """The cameras of a camera path, in the world of the support views, and the duration of its video in seconds.
 
-    A path that looks past the object, as one of another world does, is warned of.
+    It warns if no camera of the path sees the object, as happens if the path belongs to another world.
 
     Args:
-        path: of the file.
+        path: the file of the camera path.
         transforms: nerfstudio's dataparser_transforms.json, or None.
-        size: pixels along the longer side; as the file says where None.
-        shown: the views, turned upright.
+        size: pixels along the longer side; None takes the size in the file.
+        shown: the support views, in a world with y up.
         up: the direction that was up in their world before.
         scene: the folder that they were read from.
-        console: where it is said.
+        console: prints messages.
     """
     from hyperplanes.data.camera_path import read_camera_path
     from hyperplanes.data.dataset import locate_scene
@@ -134,7 +135,7 @@ def read_path(
     found = read_camera_path(path, transforms, document)
     cameras = upright_cameras(found.cameras, up)
     away = (camera.centres(cameras) - cameras.extrinsics.new_tensor(shown.bounds.centre)).norm(dim=1)
-    if float(away.min()) > FAR * shown.bounds.radius:  # as where the scene lies far from the origin and was shifted
+    if float(away.min()) > FAR * shown.bounds.radius:  # views far from the origin were shifted, but not the path
         found = read_camera_path(path, transforms, document, read_posed(locate_scene(scene)).origin)
         cameras = upright_cameras(found.cameras, up)
     for note in found.notes:
@@ -145,7 +146,7 @@ def read_path(
         cameras = camera.resized(cameras, max(1, round(height * scale)), max(1, round(width * scale)))
     elif max(height, width) > LARGEST_UNASKED:
         console.say(
-            f"{path}: pictures of {width}x{height}, as it says; --size makes smaller ones, which take less time"
+            f"{path}: pictures of {width}x{height}, the size in this file; smaller ones (--size) take less time"
         )
     if not _is_seen(shown.bounds, cameras):
         console.warn(
@@ -156,14 +157,15 @@ def read_path(
 
 
 FAR = 100
-"""Radii from the middle of the scene beyond which all cameras of a path may be those of another world."""
+"""Distance of all cameras of a path from the centre of the scene, in radii of the scene, above which the path may be
+in a world with another origin."""
 
 LARGEST_UNASKED = 400
-"""Pixels along the longer side above which the pictures of a camera path take long."""
+"""Pixels along the longer side above which the pictures of a camera path take long, so that a message says so."""
 
 
 def _is_seen(bounds: Sphere, cameras: PinholeCamera) -> bool:
-    """Whether a camera has some of a sphere in its cone of vision, the smallest around its picture."""
+    """Whether any camera sees a part of a sphere; a camera sees the smallest cone that contains its picture."""
     import torch
 
     from hyperplanes.geometry import cameras as camera
@@ -178,41 +180,41 @@ def _is_seen(bounds: Sphere, cameras: PinholeCamera) -> bool:
 
 
 def say_up(parts: Sequence[Views | Posed], console: Console) -> str:
-    """The direction that is up in the world of one scene: as stated, from how its cameras are held, or y.
+    """The up direction of one scene, which is also printed: as stated, guessed from how the cameras are held, or y.
 
     Args:
-        parts: of the scene.
-        console: where it is said.
+        parts: the views of the scene, in one or more sets.
+        console: prints the direction.
     """
     from hyperplanes.data.upright import guess_up
     from hyperplanes.geometry import cameras as camera
 
     if (stated := parts[0].up) is not None:
-        console.say(f"up: {stated}, as the files say; --up overrides it")
+        console.say(f"up: {stated}, as the files state; --up overrides it")
         return stated
     guessed = guess_up(camera.concatenate([part.cameras for part in parts]))
     console.say(
-        f"up: {guessed}, from how the cameras are held; --up overrides it"
+        f"up: {guessed}, guessed from how the cameras are held; --up overrides it"
         if guessed
-        else "up: y, as the cameras do not tell; --up overrides it"
+        else "up: y, because the cameras show no up direction; --up overrides it"
     )
     return guessed or "y"
 
 
 INPUT = re.compile(r"images(_\d+)?|image|input|rgb|masks?|pose|sparse|dense|distorted|colmap")
-"""Names of the folders of a scene that readers look into."""
+"""Names of the folders of a scene from which files are read."""
 
 
 def refuse_sources(folder: Path, path: Path, task: Task | None = None) -> None:
-    """One line where pictures would be written over those that are read, or to where they are read next time.
+    """Refuse to write pictures over the images of a scene, or into a folder where they would be read as its images.
 
     Args:
-        folder: to write into.
-        path: of the posed images that are read, or of a data set.
-        task: what was read of it, where it was.
+        folder: the folder to write into.
+        path: the posed images that are read, or a data set.
+        task: the views that were read from it, if they were read already.
 
     Raises:
-        ValueError: a folder that holds one of them, or one of a scene that readers look into.
+        ValueError: the folder contains images of `task`, or has the name of a folder from which a scene is read.
     """
     from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.formats.recognise import is_scene
@@ -227,6 +229,6 @@ def refuse_sources(folder: Path, path: Path, task: Task | None = None) -> None:
     read = any(INPUT.fullmatch(part) for part, _ in zip(inner, scenes, strict=False))
     if target in sources or read:
         raise ValueError(
-            f"--out: expected a folder that no pictures or poses are read from, got {folder}, which is one of {path}; "
+            f"--out: expected a folder that no images or poses are read from, got {folder}, which is one of {path}; "
             "name another"
         )

@@ -1,15 +1,16 @@
-"""Train a model on a data set; what `generate` writes, or any other layout that `inspect` can read.
+"""Train a model on a data set that `generate` wrote, or on any other layout that `inspect` can read.
 
-The model is evaluated on held-out objects at intervals. Checkpoints are written to --out on the way; interrupted, the
-same command goes on from the last one. Ctrl-C stops after a checkpoint; a second Ctrl-C stops immediately.
-SIGTERM, as a cluster sends it, stops after a checkpoint too. Beside the weights lie config.yaml, which --config takes,
-curve.csv, and samples/ with held-out views beside the truth; best/ holds the model that was best on held-out objects.
+The model is evaluated on held-out objects at intervals. Checkpoints are written to --out during the training; to resume
+an interrupted training from the last one, run the same command again. Ctrl-C stops after a checkpoint is written, as
+does the SIGTERM of a cluster; a second Ctrl-C stops immediately. Beside the weights, --out has config.yaml (for the
+option --config), curve.csv, samples/ with held-out views beside the true images, and best/ with the model that had the
+highest PSNR on held-out objects.
 
-With --devices N, N processes of this machine share the objects of every step, one a GPU; --nodes M takes as many on
-each of M machines. Started by torchrun, it takes the processes that torchrun has started.
+With --devices N, N processes on this machine share the objects of every step, one per GPU; with --nodes M, N processes
+on each of M machines do. If torchrun starts this command, its processes are used.
 
-Every field of the model and of the training is an option too, such as --model.hypernetwork.views 3 or
---training.learning-rate 1e-3; `hyperplanes presets quick` prints all of them with their values, as a file for --config.
+Every setting of the model and of the training is an option too, such as --training.learning-rate 1e-3. To see all of
+them with their values, as a file for --config, run `hyperplanes presets quick`.
 
 Example:
     hyperplanes train --data data/cars --preset quick --out runs/cars
@@ -55,39 +56,39 @@ __all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 
 
 BROUGHT = {"Fields": "hyperplanes.fields"}
-"""Groups of entry points whose names are fields and methods."""
+"""Groups of entry points whose names are fields and methods, by their heading in the help."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to train, and on what.
+    """The options of `train`.
 
     Attributes:
-        data: The data set, or several whose objects are drawn alike.
-        out: The folder for checkpoints; a training that was interrupted there goes on.
-        config: A YAML file of settings, such as the config.yaml of another run, whole or in part.
-        preset: One of `hyperplanes presets`: what holds where nothing else is said; quick where no file says otherwise.
+        data: The data set, or several data sets whose objects are drawn with equal probability.
+        out: The folder for checkpoints. A training that was interrupted there is resumed.
+        config: A YAML file with all or some of the settings, such as the config.yaml of another training.
+        preset: The preset with all other settings; see `hyperplanes presets`. By default that of --config, or quick.
         method: hyperplanes; a target network alone with one set of weights for all objects: point_multiplane,
             multiplane, nerf, image_based, or a field of another package; autoencoder; or a learned initialisation:
             mv_meta, sv_meta (Reptile from many views or a single one), maml, maml_first_order, mv_matched (random
             weights matched to mv_meta).
-        field: Which target network: nerf, multiplane, point_multiplane, image_based, simplified_nerf, or that of
-            another package; when not given the preset's, or for learned initialisations NeRF.
-        support: Support views and ImagePlanes an object; more than the data set has are taken from its query views.
-        checkpoint: Weights to begin with instead of random ones: a checkpoint, or a packaged model such as small; for
-            mv_matched the checkpoint of mv_meta that it is to match.
-        protocol: How rays are sampled: paper is 64 + 128 times each on every ray, ray_marching only where something is;
-            as the preset says where not given.
-        steps: Training steps; the preset's when not given.
+        field: The target network: nerf, multiplane, point_multiplane, image_based, simplified_nerf, or that of another
+            package. By default that of the preset, and for learned initialisations NeRF.
+        support: Support views and ImagePlanes per object. If the data set has fewer, query views are added.
+        checkpoint: The initial weights instead of random ones: a checkpoint, or a packaged model such as small. For
+            mv_matched, the checkpoint of mv_meta that it is matched to.
+        protocol: How rays are sampled: paper takes 64 + 128 samples on every ray, ray_marching takes samples only in
+            occupied space, default is as in the preset.
+        steps: Training steps. By default those of the preset.
         epochs: Instead of steps: how often each object is drawn, on average.
-        seed: Of the first weights and of every draw.
-        cache_size: GiB of memory for prepared objects, and as much again for their decoded pictures; 2 by default.
+        seed: The seed of the initial weights and of every random draw.
+        cache_size: Memory in GiB for prepared objects, and as much again for their decoded images. By default 2.
         legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.
         tensorboard: Write event files for TensorBoard to --out/tensorboard.
         device: auto, cpu or cuda.
-        devices: Processes on this machine that share the objects of every step: one a GPU, or several on the CPU.
-        nodes: Machines that take part, each started with the same command, with MASTER_ADDR, MASTER_PORT and NODE_RANK
-            in its environment; --out is a folder that all of them see.
+        devices: Processes on this machine that share the objects of every step: one per GPU, or several on the CPU.
+        nodes: Machines that share the objects of every step. Run the same command on each, with MASTER_ADDR,
+            MASTER_PORT and NODE_RANK in its environment. All of them must have access to the folder --out.
     """
 
     data: tuple[Path, ...]
@@ -112,11 +113,11 @@ class Arguments:
 
 
 def progress_line(progress: Progress, best: float | None = None) -> str:
-    """Loss, quality on held-out objects, speed, time left.
+    """A line with the loss, the PSNR on held-out objects, the speed and the time left.
 
     Args:
-        progress: of this step.
-        best: the quality to show where this step did not look at it.
+        progress: the progress at this step.
+        best: the PSNR to show if this step had no validation.
     """
     quality = progress.psnr if progress.psnr is not None else best
     held_out = f"held-out {quality:5.2f} dB" if quality is not None else "held-out    -    "
@@ -127,13 +128,13 @@ def progress_line(progress: Progress, best: float | None = None) -> str:
 
 
 @contextmanager
-def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[list[type[KeyboardInterrupt]]]:
-    """The first Ctrl-C, SIGTERM or SIGHUP ends the training after its step, the second one at once.
+def _stopping_on_signals(trainer: Trainer, bar: Bar) -> Generator[list[type[KeyboardInterrupt]]]:
+    """A context in which the first Ctrl-C, SIGTERM or SIGHUP ends the training after its step, and a second at once.
 
-    A terminal that is closed sends SIGHUP more than once, which counts as one.
+    A terminal that is closed sends SIGHUP more than once; it counts once.
 
     Yields:
-        What was heard.
+        The exceptions of the signals that were received.
     """
     heard: list[type[KeyboardInterrupt]] = []
 
@@ -144,7 +145,7 @@ def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[list[type[Keyboar
         if len(heard) > 1:
             raise heard[-1]
         trainer.stopping = True
-        bar.warn(f"{signal.Signals(number).name}: stopping after this step; once more to stop at once")
+        bar.warn(f"{signal.Signals(number).name}: stopping after this step; send it again to stop at once")
 
     before = {number: signal.signal(number, note) for number in listened_to()}
     try:
@@ -155,20 +156,20 @@ def _polite_interrupt(trainer: Trainer, bar: Bar) -> Generator[list[type[Keyboar
 
 
 def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None:
-    """Train to the end and show how it goes.
+    """Train to the end and show the progress.
+
+    After Ctrl-C, a checkpoint is written and KeyboardInterrupt is raised with advice as its text; after SIGTERM it is
+    `Terminated`, and after SIGHUP `HungUp`.
 
     Args:
-        trainer: at any step.
-        bar: where a line a report is shown.
-        board: where every report goes as well.
-
-    After Ctrl-C it ends in a KeyboardInterrupt with a checkpoint written and advice as its text, after SIGTERM in
-    `Terminated` and after SIGHUP in `HungUp`, likewise.
+        trainer: a trainer at any step.
+        bar: shows a line for each report.
+        board: receives every report as well.
     """
     from hyperplanes.adaptation.diagnostics import SMALLEST_SPREAD
 
     quality = None
-    with _polite_interrupt(trainer, bar) as heard:
+    with _stopping_on_signals(trainer, bar) as heard:
         warned = False
         for progress in trainer.run():
             quality = progress.psnr if progress.psnr is not None else quality
@@ -181,20 +182,20 @@ def follow(trainer: Trainer, bar: Bar, board: TensorBoard | None = None) -> None
                     warned = True
                     bar.warn(
                         f"warning: at step {progress.step} the updates of different objects differ by less than "
-                        f"{SMALLEST_SPREAD:.0%} of their norm: the hypernetwork writes the same update for every "
+                        f"{SMALLEST_SPREAD:.0%} of their norm: the hypernetwork predicts the same update for every "
                         "object; see docs/hypernetwork.md for options that prevent it"
                     )
             bar.show(progress.step, progress.steps, line, important=progress.psnr is not None)
     if trainer.stopping and trainer.processes.first:
-        advice = f"step {trainer.step} is saved, the same command goes on from there"
+        advice = f"step {trainer.step} is saved; run the same command again to resume from there"
         raise heard[0](advice) if heard else KeyboardInterrupt(advice)
 
 
 def resolve(arguments: Arguments) -> Preset:
-    """The model and its training: the preset's, changed by the file, by the options, by the settings.
+    """The configuration of the model and its training: the preset, changed by the file, the options and the settings.
 
     Raises:
-        ValueError: an unknown name, or a value that does not fit; the message names the file or the option.
+        ValueError: an unknown name, or an invalid value; the message names the file or the option.
     """
     from hyperplanes.configuration.presets import preset
     from hyperplanes.configuration.settings_file import changed, parse_options, read_experiment
@@ -254,7 +255,7 @@ def _is_first(arguments: Arguments) -> bool:
 
 @writes_to(lambda arguments: arguments.out, _is_first)
 def run(arguments: Arguments) -> int:
-    """Train, from the start or from where it was interrupted."""
+    """Train from the start, or resume an interrupted training."""
     from hyperplanes.training.distributed import ProcessEnded
 
     try:
@@ -262,7 +263,7 @@ def run(arguments: Arguments) -> int:
     except ProcessEnded:
         if _is_first(arguments):
             raise
-        return 0  # who ended first says why
+        return 0  # the process that ended first has printed the reason
 
 
 def _run(arguments: Arguments) -> int:
@@ -294,7 +295,7 @@ def _run(arguments: Arguments) -> int:
         )
     if arguments.support is not None and chosen.training.views:
         raise ValueError(
-            "--support: expected none, since training.views says how many views are shown; --training.views changes it"
+            "--support: expected none, because training.views sets the number of support views; use --training.views"
         )
     tasks = data if arguments.support is None else WithSupport(data, arguments.support)
     reference = None
@@ -316,7 +317,7 @@ def _run(arguments: Arguments) -> int:
             f"{len(trainer.loader.names)} objects to train on, {held_out} held out{shared}"
         )
         if trainer.step:
-            console.say(f"going on from step {trainer.step}")
+            console.say(f"resuming from step {trainer.step}")
         watched = arguments.tensorboard and first
         board = TensorBoard(arguments.out / "tensorboard", trainer.step) if watched else None
         try:
@@ -326,7 +327,7 @@ def _run(arguments: Arguments) -> int:
             if board is not None:
                 board.close()
     more = trainer.step > chosen.training.steps
-    before = f" before, and for no more now: --steps is {chosen.training.steps}" if more else ""
+    before = f" before; nothing was trained now, because --steps is {chosen.training.steps}" if more else ""
     console.say(f"{arguments.out}: trained for {trainer.step} steps{before}")
     if held_out:
         given = ["--data", arguments.data[0], "--checkpoint", arguments.out, "--method", method]

@@ -1,8 +1,8 @@
-"""Show an object in the browser: turn it, see the photographs where they were taken, and watch it get sharper.
+"""Show an object in the browser: it can be turned, and the photographs are at the poses where they were taken.
 
-Given posed images, a model adapts to them and the page shows the field at once, after every few fine-tuning steps, and
-in the end as baked voxels, which turn without delay. Given a file that `bake` wrote, the page shows that. Ctrl-C ends
-it.
+A model adapts to the posed images. The page shows its field at once, again after every few fine-tuning steps, and at
+the end as baked voxels, which turn without delay. If --checkpoint is a file that `bake` wrote, the page shows its
+voxels. Ctrl-C ends the command.
 
 Example:
     hyperplanes view example-car
@@ -49,16 +49,16 @@ EVERY = 5  # fine-tuning steps between two pictures
 
 @dataclass(frozen=True)
 class Arguments(ViewsArguments):
-    """What to show.
+    """The options of `view`.
 
     Attributes:
-        views: The posed images of the object; example-car comes with the package.
-        checkpoint: What adapts to them, or a file that `bake` wrote, which is shown as it is.
+        views: The posed images of the object. example-car comes with the package.
+        checkpoint: The model that adapts to them, or a file that `bake` wrote, which is shown unchanged.
         steps: Fine-tuning steps on the views.
-        fit: Gradient steps that fit the baked voxels to the views; 0 shows the field itself and bakes nothing.
-        compare: Methods of `hyperplanes evaluate` to see beside the model on the right half of the page, such as
+        fit: Gradient steps that fit the baked voxels to the views. With 0, the field is shown and no voxels are baked.
+        compare: Methods of `hyperplanes evaluate` to show beside the model, on the right half of the page, such as
             hull_blend, nearest_view, hyperplanes (the model without gradient steps), or scratch_100.
-        port: Of the page on this machine.
+        port: The port of the page on this machine.
     """
 
     views: tyro.conf.Positional[Path]
@@ -78,7 +78,7 @@ def run(arguments: Arguments) -> int:
     require_viewer()
     warnings.filterwarnings(
         "ignore", "Queued a .* on a closed connection", UserWarning
-    )  # viser's, of visitors who left
+    )  # a warning of viser if a browser closed the page
     console, device = Console(), choose_device(arguments.device)
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     given = {
@@ -96,7 +96,7 @@ def run(arguments: Arguments) -> int:
     others = _others(arguments, device)
     viewer = LiveViewer(shown, arguments.port, None if baked else wanted.put, list(others))
     if arguments.port not in (0, urlsplit(viewer.address).port):
-        console.warn(f"--port: {arguments.port} is taken, and the next that is free is used")
+        console.warn(f"--port: {arguments.port} is in use; the next free port is taken")
     console.say(f"{viewer.address}: open it in a browser; Ctrl-C ends it")
     try:
         if isinstance(source, BakedScene):
@@ -106,7 +106,7 @@ def run(arguments: Arguments) -> int:
             return 0
         number = len(shown)
         while True:
-            for name in others:  # what is shown of it was made of another number of views
+            for name in others:  # its current field is of another number of views
                 viewer.show_other(name, None, f"{name}: not adapted yet")
             with suppress(_Superseded):
                 _adapt(source, shown[:number], arguments, viewer, wanted, console)
@@ -140,11 +140,11 @@ def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
 
 
 class _Superseded(Exception):
-    """Another number of views is wanted."""
+    """Another number of views was requested on the page."""
 
 
 def _check(wanted: queue.SimpleQueue[int]) -> None:
-    """End what is made of a number of views where another is wanted."""
+    """Raise `_Superseded` if another number of views was requested, to end the work on the current number."""
     if not wanted.empty():
         raise _Superseded
 
@@ -152,9 +152,9 @@ def _check(wanted: queue.SimpleQueue[int]) -> None:
 def _show_others(
     others: Mapping[str, Adapter], shown: Views, viewer: LiveViewer, wanted: queue.SimpleQueue[int], console: Console
 ) -> None:
-    """Shows the other methods one after the other.
+    """Show the other methods one after the other.
 
-    Where one does not take so few views, the reason is said.
+    If a method cannot adapt to this number of views, the page and the terminal show the reason.
     """
     for name, adapter in others.items():
         _check(wanted)
@@ -169,7 +169,7 @@ def _show_others(
 def _fields(
     model: HyperPlanes, context: SupportContext, views: Views, steps: int
 ) -> Iterator[tuple[int, AdaptedField | None]]:
-    """Numbers of steps done, each with the field after them where that is to be shown."""
+    """The number of steps done, after each step, with the field if it is to be shown after this step."""
     import torch
 
     from hyperplanes.adaptation.fine_tuning import average_of, make_descent
@@ -199,13 +199,13 @@ def _adapt(
     wanted: queue.SimpleQueue[int],
     console: Console,
 ) -> None:
-    """Shows the field as it is adapted, fine-tuned and baked."""
+    """Show the field when it is adapted, while it is fine-tuned, and when it is baked."""
     from hyperplanes.adaptation.canonical_frame import to_canonical_frame
     from hyperplanes.adaptation.context import trained_on
     from hyperplanes.export.baking import BakedScene, default_side
 
     console.say(f"adapting to {len(shown)} views")
-    model = model.without_residuals()  # for which the page would wait too long
+    model = model.without_residuals()  # correction would take too long for an interactive page
     placed, steps = to_canonical_frame(model, shown), arguments.steps if len(shown) > 1 else 0
     context, field = placed.context(model), None
     for done, made in _fields(model, context, trained_on(context, placed.views), steps):

@@ -1,4 +1,4 @@
-"""Verbs that write into a folder, of which one runs at a time there."""
+"""Checks of output files and folders, and a lock so that one process at a time writes into a folder."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ __all__ = ["check_output", "keep_if_possible", "refuse_checkpoint", "writes_to"]
 READ = re.compile(
     r"(manifest|model|training|transforms|diagnostics|initial)([-_]\w+)?\.json|.*_splits\.json|config\.yaml"
 )
-"""Names of files that this program reads as a model, a training or a data set."""
+"""Names of files that are read as a part of a model, a training or a data set."""
 
 WEIGHTS = re.compile(r"(model|training-\d+)\.safetensors")
 
 
 def keep_if_possible(path: Path, keep: Callable[[], None], console: Console) -> None:
-    """Keep what was computed for another time; where that fails it is there all the same, and a warning says so.
+    """Write a result to the disk cache; if that fails, warn and continue.
 
     Args:
-        path: where it is kept.
+        path: the file or folder in the cache, for the warning.
         keep: writes it.
-        console: of the warning.
+        console: prints the warning.
     """
     try:
         keep()
     except OSError as error:
-        console.warn(f"{path}: not kept for another time: {error}")
+        console.warn(f"{path}: not kept for later commands: {error}")
 
 
 def refuse_checkpoint(out: Path, checkpoint: Path) -> None:
-    """One line where what is made of a model would take the place of a model.
+    """Refuse an output that would replace a trained model.
 
     Args:
-        out: a folder for a checkpoint, or a file of weights.
+        out: a folder for a checkpoint, or a safetensors file.
         checkpoint: the model that is read.
 
     Raises:
-        ValueError: the folder of the model that is read or of a training, or a file of a checkpoint.
+        ValueError: the output is the folder of that model or of a training, or a file of a checkpoint.
     """
     from hyperplanes.adaptation.checkpoints import checkpoint_folder, find_checkpoints
 
@@ -55,19 +55,19 @@ def refuse_checkpoint(out: Path, checkpoint: Path) -> None:
         models = (checkpoint_folder(checkpoint), *find_checkpoints([checkpoint]).values())
         taken = out.resolve() in {path.resolve() for path in models} or (out / "training.json").exists()
     if taken:
-        raise ValueError(f"--out: expected a place of its own, got {out}, where a trained model is; name another")
+        raise ValueError(f"--out: expected a path without a trained model, got {out}, where one is; name another")
 
 
 def check_output(option: str, path: Path | None) -> None:
-    """One line, before anything is computed, where a file cannot be written or is one that this program reads.
+    """Refuse an output file that cannot be written, or that would replace a file of a model, training or data set.
 
     Args:
-        option: the name of the option.
-        path: the file, or None.
+        option: the name of the option, without dashes.
+        path: the file; None is accepted.
 
     Raises:
-        ValueError: a folder, a file where its folder should be, a folder that may not be written to, or a file of a
-            model, a training or a data set.
+        ValueError: a folder, a path below a file, a folder without write permission, or a file of a model, a training
+            or a data set.
     """
     if path is None:
         return
@@ -90,14 +90,14 @@ def writes_to(
     when: Callable[[Any], bool] = lambda arguments: True,
     check: Callable[[Any], None] = lambda arguments: None,
 ) -> Callable[[Callable[[Any], int]], Callable[[Any], int]]:
-    """A decorator of a verb's `run`: it fails at once where another process writes into the same folder.
+    """A decorator for the `run` of a verb, which fails at once if another process writes into the same folder.
 
-    A folder that was not there before and that a failure leaves empty is removed again.
+    If the verb fails, folders that were created and are empty are removed again.
 
     Args:
-        folder: from a verb's arguments the folder that it writes into, as in `utilities.writing.one_writer`.
-        when: whether this process writes there at all; of the processes of one training, the first one alone does.
-        check: what raises where the folder may not be written into, before it is made.
+        folder: returns the folder that the verb writes into, as in `utilities.writing.one_writer`, from its arguments.
+        when: whether this process writes there. Of the processes of one training, only the first one does.
+        check: called before the folder is created; it raises if the folder may not be written into.
 
     Returns:
         The decorator.
@@ -117,7 +117,7 @@ def writes_to(
                 with one_writer(place):
                     return run(arguments)
             except BaseException:
-                with suppress(OSError):  # of a folder with something in it, and all above
+                with suppress(OSError):  # a folder that is not empty stays, with all folders above it
                     for each in made:
                         each.rmdir()
                 raise

@@ -1,4 +1,4 @@
-"""Scores on objects and views that no method saw, and what sets of scores say of each other."""
+"""Evaluation of methods on query views of held-out objects, and comparison of their scores."""
 
 from hyperplanes.evaluation.scores import (
     QUANTITIES,

@@ -1,4 +1,4 @@
-"""Two methods on the same objects: paired differences, their interval and a test."""
+"""Comparison of two methods on the same objects: paired differences, their confidence interval and a t-test."""
 
 from __future__ import annotations
 
@@ -18,17 +18,19 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Comparison:
-    """How much more of a quantity the first of two methods reaches, over objects.
+    """The differences of a quantity between two methods, over objects.
 
     Attributes:
-        first: a method.
-        second: the other.
-        quantity: such as "psnr".
-        differences: first minus second, by object; means over the seeds where there were several.
-        mean: of the differences.
-        low: the lower end of the 95 % interval of the mean, by Student's t; None of fewer than two objects.
-        high: its upper end.
-        p: of the paired t-test, two-sided: how likely such a mean is where the methods do not differ.
+        first: the name of a method.
+        second: the name of another method.
+        quantity: the name of the quantity, such as "psnr".
+        differences: first minus second, by object; if there are several seeds, of the means over them.
+        mean: the mean of the differences.
+        low: the lower end of the 95 % confidence interval of the mean, by Student's t; None with fewer than two
+            objects.
+        high: the upper end of the interval; None with fewer than two objects.
+        p: the p-value of the two-sided paired t-test: the probability of a mean at least this far from 0 if the methods
+            do not differ. None with fewer than two objects.
     """
 
     first: str
@@ -41,23 +43,24 @@ class Comparison:
     p: float | None
 
     def as_json(self) -> dict[str, Any]:
-        """All but the names of methods and quantity."""
+        """All attributes but the names of the methods and of the quantity, as values for JSON."""
         whole = asdict(self)
         return {name: whole[name] for name in ("mean", "low", "high", "p", "differences")}
 
 
 def compare(first: Score, second: Score, quantity: str = "psnr") -> Comparison:
-    """Paired comparison of two methods over the objects of both.
+    """Paired comparison of two methods over the same objects.
 
-    The objects of a class are the sample; what is concluded holds for other objects of it, for these trainings.
+    The objects are a sample of their class. So the result holds for other objects of the class, with these trained
+    models.
 
     Args:
-        first: one row.
-        second: another, of the same objects.
+        first: the score of a method.
+        second: the score of another method, on the same objects.
         quantity: one of `evaluation.QUANTITIES`.
 
     Raises:
-        ValueError: other objects, or a quantity that is missing or not finite for one.
+        ValueError: different objects, or a quantity that is missing or not finite for an object.
     """
     ours = {each.name: getattr(each, quantity) for each in first.objects}
     theirs = {each.name: getattr(each, quantity) for each in second.objects}
@@ -74,7 +77,10 @@ def compare(first: Score, second: Score, quantity: str = "psnr") -> Comparison:
 
 
 def compare_all(scores: Sequence[Score]) -> list[Comparison]:
-    """Every pair of methods whose PSNR is finite on every object, the better one first, largest difference first."""
+    """Compares all pairs of methods by PSNR, the better one first, in descending order of the difference.
+
+    Methods with an infinite PSNR or NaN on some object are left out.
+    """
     whole = [score for score in scores if math.isfinite(score.mean("psnr"))]
     ordered = sorted(whole, key=lambda score: -score.mean("psnr"))
     pairs = [compare(first, second) for first, second in combinations(ordered, 2)]
@@ -82,7 +88,7 @@ def compare_all(scores: Sequence[Score]) -> list[Comparison]:
 
 
 def _interval(values: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """The ends of the interval and p; differences that are all alike leave no doubt."""
+    """The ends of the interval, and p; None with fewer than two values. Equal values have an interval of length 0."""
     from scipy.stats import ttest_1samp
 
     if len(values) < 2:

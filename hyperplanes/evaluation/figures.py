@@ -1,4 +1,4 @@
-"""Scores of several methods as figures: boxes over objects, PSNR over fine-tuning steps, pictures side by side."""
+"""Figures of the scores of several methods: boxes over objects, PSNR over fine-tuning steps, pictures side by side."""
 
 from __future__ import annotations
 
@@ -18,7 +18,12 @@ __all__ = ["PictureGrid", "save_boxes", "save_curves"]
 
 
 def save_boxes(scores: Sequence[Score], path: Path) -> None:
-    """The objects' PSNR, a box a method."""
+    """Draw the PSNR of the objects as one box per method.
+
+    Args:
+        scores: the scores of the methods.
+        path: the file of the figure.
+    """
     figure = new_figure(max(5.0, 1.4 * len(scores)), 4.0)
     axes = figure.subplots()
     draw_boxes(axes, {score.method: [each.psnr for each in score.objects] for score in scores})
@@ -28,12 +33,12 @@ def save_boxes(scores: Sequence[Score], path: Path) -> None:
 
 
 def save_curves(curves: Mapping[str, Sequence[tuple[float, float]]], steps: Sequence[int], path: Path) -> None:
-    """PSNR over fine-tuning steps of every method.
+    """Draw PSNR over fine-tuning steps for every method.
 
     Args:
-        curves: steps and PSNR by method.
-        steps: that the axis is marked at.
-        path: of the figure.
+        curves: pairs of steps and PSNR in dB, by method.
+        steps: the ticks of the horizontal axis.
+        path: the file of the figure.
     """
     figure = new_figure(6.0, 3.6)
     axes = figure.subplots()
@@ -44,7 +49,7 @@ def save_curves(curves: Mapping[str, Sequence[tuple[float, float]]], steps: Sequ
 
 
 class PictureGrid:
-    """A query view of each of the first objects, by the first seed of every method, beside the truth."""
+    """Draws a query view of each of the first `rows` objects, by the first seed of every method, beside the truth."""
 
     rows = 6
 
@@ -52,7 +57,14 @@ class PictureGrid:
         self.seen: dict[str, dict[str, npt.NDArray[np.uint8]]] = {}
 
     def add(self, method: str, seed: int, task: Task, pictures: Pictures) -> None:
-        """Keep a picture, where its row is one of the first."""
+        """Keep a picture of an object if it is one of the first `rows` objects and the seed is 0.
+
+        Args:
+            method: the name of the method.
+            seed: the seed.
+            task: the object.
+            pictures: the rendered query views.
+        """
         if seed or (task.name not in self.seen and len(self.seen) >= self.rows):
             return
         view = len(task.query) // 4
@@ -60,12 +72,12 @@ class PictureGrid:
         found[method] = to_pixels(pictures.images[view : view + 1])[0]
 
     def save(self, path: Path) -> None:
-        """Draw the grid, of the objects that no method failed on.
+        """Draw the grid with the objects on which no method failed.
 
-        Where there is no such object, it is drawn of the methods that failed on none.
+        If there is no such object, it has the methods that failed on no object.
 
         Args:
-            path: of the picture (PNG, SVG or PDF).
+            path: the file of the figure (PNG, SVG or PDF).
         """
         columns = list(dict.fromkeys(name for row in self.seen.values() for name in row))
         whole = {name: row for name, row in self.seen.items() if len(row) == len(columns)}

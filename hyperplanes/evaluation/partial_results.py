@@ -1,4 +1,4 @@
-"""What a long evaluation has measured so far, on the disk."""
+"""A file with the scores that an evaluation has measured so far."""
 
 from __future__ import annotations
 
@@ -12,9 +12,13 @@ __all__ = ["PartialResults"]
 
 
 class PartialResults:
-    """What has been measured so far, in a file beside the one of `--json` until that is written."""
+    """Writes the scores so far to NAME.partial.json beside the file NAME.json of `--json`, until that is written.
 
-    seconds = 10.0  # between two writings
+    Args:
+        path: the file of `--json`; with None, nothing is written.
+    """
+
+    seconds = 10.0  # least time between two writes
 
     def __init__(self, path: Path | None) -> None:
         self.path = None if path is None else path.with_name(f"{path.stem}.partial.json")
@@ -22,7 +26,7 @@ class PartialResults:
         self._written = 0.0
 
     def add(self, method: str, seed: int, score: ObjectScore) -> None:
-        """Keep a score; the file is written at most every ten seconds."""
+        """Add a score; the file is written at most every ten seconds."""
         row = f"{method}, seed {seed}" if seed else method
         self._found.setdefault(row, {})[score.name] = score.as_json()
         if self.path is not None and time.monotonic() - self._written > self.seconds:

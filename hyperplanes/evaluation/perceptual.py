@@ -1,12 +1,12 @@
-"""LPIPS, the perceptual distance of Zhang et al. 2018, by AlexNet and with weights that the user provides.
+"""LPIPS, the perceptual distance of Zhang et al. 2018, with AlexNet and weights that the user provides.
 
-The weights are the state of the `lpips` package's network, written once, where that package is installed, by
+The weights are the state dict of the network of the package `lpips`. Where that package is installed, this writes them:
 
     import lpips, safetensors.torch
     state = lpips.LPIPS(net="alex").state_dict()
     safetensors.torch.save_file({name: value.clone() for name, value in state.items()}, "lpips-alex.safetensors")
 
-The package itself is no dependency: it depends on torchvision, which installs another build of torch.
+The package itself is not a dependency, because it depends on torchvision, which installs another build of torch.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ CONVOLUTIONS = (
     ("net.slice4.8", 256, 384, 3, 1, 1, False),
     ("net.slice5.10", 256, 256, 3, 1, 1, False),
 )
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of RGB in [-1, 1], as the package has them
-SMALLEST = 32  # pixels: two poolings of a quarter of them
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of RGB in [-1, 1], as in the package
+SMALLEST = 32  # pixels along a side: the first convolution has stride 4, and two poolings follow
 
 
 class LPIPS:
-    """The distance of two pictures in the features of AlexNet, weighted to agree with people's judgments.
+    """The distance of two pictures in the features of AlexNet, weighted to agree with human judgements.
 
     Args:
-        path: the weights as safetensors, see above.
-        device: where to compute.
+        path: the safetensors file of the weights, as described above.
+        device: the device to compute on.
 
     Raises:
-        CheckpointError: no such file, or tensors that are missing or of another shape.
+        CheckpointError: the file does not exist, or tensors are missing or have other shapes.
     """
 
     def __init__(self, path: Path, device: torch.device | str = "cpu") -> None:
@@ -59,10 +59,10 @@ class LPIPS:
     def __call__(
         self, predicted: Float[Tensor, "view 3 height width"], truth: Float[Tensor, "view 3 height width"]
     ) -> Float[Tensor, " view"]:
-        """The distance of each picture to the truth, both RGB in [0, 1]; 0 for equal ones.
+        """The distance of each picture from the true image, both RGB in [0, 1]; 0 if they are equal.
 
         Raises:
-            ValueError: pictures smaller than 32 x 32.
+            ValueError: pictures smaller than 32 x 32 pixels.
         """
         if min(truth.shape[2:]) < SMALLEST:
             expected = f"at least {SMALLEST} x {SMALLEST} pixels for LPIPS"
@@ -80,12 +80,12 @@ class LPIPS:
         return total.to(truth.device)
 
     def _scaled(self, images: Tensor) -> Tensor:
-        """RGB in [0, 1] as AlexNet was trained on it."""
+        """RGB in [0, 1], normalised as in the training of AlexNet."""
         images = images.float().to(next(iter(self.weights.values())).device)
         shift, scale = (images.new_tensor(each).view(1, 3, 1, 1) for each in (SHIFT, SCALE))
         return (2 * images - 1 - shift) / scale
 
 
 def _unit(features: Tensor) -> Tensor:
-    """Features of length one in every place."""
+    """Features with length 1 at every pixel."""
     return features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)

@@ -1,4 +1,4 @@
-"""The tables: every method through the same code, on objects and views it never saw."""
+"""Scores of methods: all methods are evaluated by the same code, on query views of the same objects."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ QUANTITIES = (
 """The numbers of an `ObjectScore`, in the order of the tables."""
 
 Perceptual = Callable[[Float[Tensor, "view 3 h w"], Float[Tensor, "view 3 h w"]], Float[Tensor, " view"]]
-"""LPIPS, such as `perceptual.LPIPS`: (predicted, truth) -> a distance an image."""
+"""LPIPS, such as `perceptual.LPIPS`: (predicted, truth) -> one distance per image."""
 
 
 @dataclass(frozen=True)
 class ObjectScore:
-    """One object by one method.
+    """The score of one method on one object.
 
     Attributes:
-        name: of the object.
-        psnr: dB, mean over its query views.
-        ssim: mean over its query views.
-        adapt_seconds: from support views to a field.
-        render_seconds: of one query view.
-        psnr_pooled: dB, of the squared error of all its query views together.
-        psnr_foreground: dB, inside the true masks, mean over its query views; None where no mask has a pixel.
-        lpips: mean over its query views; None where its weights were not given.
-        query_views_shown: how many of its query views, by their poses, are among the support views; None for none.
+        name: the name of the object.
+        psnr: PSNR in dB, mean over its query views.
+        ssim: SSIM, mean over its query views.
+        adapt_seconds: seconds from support views to a field.
+        render_seconds: seconds to render one query view.
+        psnr_pooled: PSNR in dB of the mean squared error over all its query views together.
+        psnr_foreground: PSNR in dB inside the true masks, mean over its query views; None if no mask has a pixel.
+        lpips: LPIPS, mean over its query views; None if no weights were given.
+        query_views_shown: the number of query views whose poses are among those of the support views; None for 0.
     """
 
     name: str
@@ -59,23 +59,23 @@ class ObjectScore:
     query_views_shown: float | None = None
 
     def as_json(self) -> dict[str, float]:
-        """The numbers that there are."""
+        """The numbers that were measured, by name."""
         return {name: value for name in QUANTITIES if (value := getattr(self, name)) is not None}
 
     @property
     def image_seconds(self) -> float:
-        """From support views to the picture of one query view."""
+        """Seconds from support views to the picture of one query view."""
         return self.adapt_seconds + self.render_seconds
 
 
 @dataclass(frozen=True)
 class Score:
-    """A row of the table: means over objects, and the objects themselves.
+    """The scores of one method on several objects: a row of the table.
 
     Attributes:
         method: the name of the row.
-        objects: each a mean over the seeds, where there were several.
-        seeds: the rows of the single seeds, where there were several.
+        objects: the scores of the objects; if there are several seeds, their means over these.
+        seeds: the score of each seed, if there are several.
     """
 
     method: str
@@ -83,31 +83,31 @@ class Score:
     seeds: tuple[Score, ...] = ()
 
     def mean(self, quantity: str) -> float:
-        """Mean of one of `ObjectScore`'s numbers over the objects that have it; NaN where none has."""
+        """Mean of a number of `ObjectScore` over the objects that have it; NaN if none has."""
         found = self._numbers(quantity)
         return fmean(found) if found else math.nan
 
     def spread(self, quantity: str) -> float:
-        """Standard deviation over the objects that have it."""
+        """Standard deviation of a number over the objects that have it; NaN if none has, or if one is not finite."""
         found = self._numbers(quantity)
         return pstdev(found) if found and all(map(math.isfinite, found)) else math.nan
 
     def _numbers(self, quantity: str) -> list[float]:
-        """One of the numbers, of every object that has it."""
+        """A number of every object that has it."""
         return [value for each in self.objects if (value := getattr(each, quantity)) is not None]
 
     def deviation(self, quantity: str) -> float | None:
-        """Standard deviation over seeds of the mean over objects; None of fewer than two, or of infinite means."""
+        """Standard deviation over seeds of the mean over objects; None with fewer than two seeds, or infinite means."""
         means = [seed.mean(quantity) for seed in self.seeds]
         return stdev(means) if len(means) > 1 and all(map(math.isfinite, means)) else None
 
     @property
     def quantities(self) -> list[str]:
-        """The numbers that any object has."""
+        """The names of the numbers that at least one object has."""
         return [name for name in QUANTITIES if self._numbers(name)]
 
     def as_json(self) -> dict[str, Any]:
-        """The row as it stands in metrics.json."""
+        """The row as a value for JSON, as in metrics.json."""
         row: dict[str, Any] = {name: self.mean(name) for name in self.quantities}
         row["objects"] = {each.name: each.as_json() for each in self.objects}
         if self.seeds:
@@ -117,7 +117,7 @@ class Score:
 
     @classmethod
     def of_json(cls, method: str, value: Mapping[str, Any]) -> Score:
-        """The row that `as_json` wrote; infinity comes back of null."""
+        """The row from the result of `as_json`; null is read as infinity, because JSON has no infinity."""
 
         def score(name: str, numbers: Mapping[str, float | None]) -> ObjectScore:
             return ObjectScore(name, **{key: math.inf if each is None else each for key, each in numbers.items()})
@@ -127,16 +127,16 @@ class Score:
 
 
 def merge_seeds(scores: Sequence[Score]) -> Score:
-    """One row of the rows of several seeds: every object's numbers are means over them.
+    """The score of a method over several seeds: the numbers of every object are means over the seeds.
 
     Args:
-        scores: of one method on the same objects in the same order.
+        scores: the scores of one method, one per seed, on the same objects in the same order.
 
     Raises:
-        ValueError: none, or other objects.
+        ValueError: no score, or different objects.
     """
     if not scores:
-        raise ValueError("scores: expected those of at least one seed, got none")
+        raise ValueError("scores: expected the score of at least one seed, got none")
     if len(scores) == 1:
         return scores[0]
     names = [[each.name for each in score.objects] for score in scores]
@@ -161,25 +161,26 @@ def evaluate(
     lpips: Perceptual | None = None,
     on_failure: Callable[[str, Exception], None] | None = None,
 ) -> Score:
-    """Adapt to the support views of each object and compare all its query views.
+    """Adapt to the support views of each object, render its query views and compare them with the true images.
 
-    The method computes where its weights are; pictures are compared where the data is.
+    The method computes on the device of its weights; pictures are compared on the device of the data.
 
     Args:
         method: the name of the row.
         adapter: the method.
-        data: where the tasks are.
-        names: the objects, never trained on.
-        on_object: called after each, with its score, task, pictures and field.
-        lpips: where the perceptual distance is asked for, too.
-        on_failure: called with an object that cannot be evaluated and the reason, and the next one follows; where
-            absent, the first failure ends it.
+        data: the data set.
+        names: the objects, on which the method was not trained.
+        on_object: called after each object, with its score, task, pictures and field.
+        lpips: the perceptual distance, if it is to be measured.
+        on_failure: called with the name of an object that cannot be evaluated and the error, after which the next
+            object follows. With None, the first error is raised.
 
     Returns:
-        The row, of the objects that did not fail.
+        The score on the objects that did not fail.
 
     Raises:
-        ValueError: no object, or one without query views or with views that cannot be used; it is named.
+        ValueError: no object, an object without query views, or views that the method cannot use. The message names the
+            object.
         OSError: an object whose files cannot be read.
     """
     if not names:
@@ -240,24 +241,24 @@ def evaluate_all(
     on_failure: Callable[[str, int, str, Exception], None] | None = None,
     lpips: Perceptual | None = None,
 ) -> list[Score]:
-    """Every method on every object, by every seed.
+    """Evaluate every method on every object with every seed.
 
     Args:
-        methods: by the names of their rows, each a function of the seed.
-        data: where the objects are; a sequence has the tasks of each seed, such as other choices of support views.
+        methods: by the names of their rows, functions that make a method from a seed.
+        data: the data set; or a sequence of data sets, one a seed, such as with other choices of support views.
         names: the objects.
-        report: called with (evaluations done, evaluations in all, what has just been found) after each.
-        seeds: how many, from 0.
+        report: called after each evaluation with the number of evaluations done, their total, and a line of text.
+        seeds: the number of seeds, from 0.
         on_object: called with a method, a seed, a task and its pictures.
-        on_score: called with a method, a seed and what has just been measured.
-        on_failure: called with a method, a seed, an object that cannot be evaluated and the reason; where absent, the
-            first failure ends it.
+        on_score: called with a method, a seed and the score of an object.
+        on_failure: called with a method, a seed, an object that cannot be evaluated and the error. With None, the first
+            error is raised.
         lpips: as in `evaluate`.
 
     Returns:
-        The rows in the order of the methods, of the objects that none of them failed on; methods that failed on every
-        object have none. Where no object is left for all methods, it is a ValueError, the first failure where
-        everything failed.
+        The scores in the order of the methods, on the objects on which none of these methods failed. Methods that
+        failed on every object are left out. ValueError if no common object is left; if everything failed, the first
+        error is raised.
     """
     done, found, errors = 0, {}, []
     by_seed = data if isinstance(data, Sequence) else [data] * seeds
@@ -290,7 +291,7 @@ def evaluate_all(
 
 
 def _of_common_objects(found: Mapping[str, Sequence[Score]]) -> dict[str, list[Score]]:
-    """The rows of the methods that did not fail on every object, of the objects that none of these failed on."""
+    """The scores of the methods that did not fail on every object, on the objects on which none of these failed."""
     whole = {method: runs for method, runs in found.items() if all(run.objects for run in runs)}
     done = [{each.name for each in run.objects} for runs in whole.values() for run in runs]
     common = set.intersection(*done) if done else set()
@@ -305,5 +306,5 @@ def _of_common_objects(found: Mapping[str, Sequence[Score]]) -> dict[str, list[S
 
 
 def _number(value: float) -> float | None:
-    """None for NaN, which says that there was nothing to measure."""
+    """The value, or None for NaN, which means that nothing could be measured."""
     return None if math.isnan(value) else value

@@ -1,4 +1,4 @@
-"""Whether a model can be expected to do well on some views, and whether it did: warnings before and after."""
+"""Warnings about a model on given views: before it adapts, if it is likely to do badly, and after, if it did badly."""
 
 from __future__ import annotations
 
@@ -12,60 +12,63 @@ from hyperplanes.adaptation.network import in_use
 from hyperplanes.utilities.metrics import psnr
 from hyperplanes.views import Views
 
-__all__ = ["held_out_psnr", "suitability_warnings", "worse_than_copying"]
+__all__ = ["FEWEST_VIEWS", "held_out_psnr", "suitability_warnings", "worse_than_copying"]
 
-COVERED = 0.95  # mean opacity above which masks say no more than none
-UNLIKE = 3.0  # deviations of the codes; held-out objects of a trained class have 0.7 to 2, other classes 3.3 to 8
-ELSEWHERE = 30.0  # degrees between camera directions, on average, above which planes stand in for others
-HELD_OUT = 4  # left-out views, and pixels along their longer side
+COVERED = 0.95  # mean opacity above which masks are as good as no masks
+UNLIKE = 3.0  # standardised codes, root mean square: 0.7 to 2 for held-out objects of a trained class, others 3.3 to 8
+ELSEWHERE = 30.0  # mean degrees between the directions of cameras and of the planes that they fill, above which to warn
+FEWEST_VIEWS = 4  # of which some are held out
+HELD_OUT = 4  # most held-out views, and pixels along their longer side
 HELD_OUT_SIZE = 64
 SHOWN_SIZE = 4 * HELD_OUT_SIZE
 
 
 def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) -> list[str]:
-    """What speaks against good pictures of these views, a sentence each, before anything has been adapted.
+    """Warnings, before adapting, about views of which the model is likely to make bad pictures. Each is one sentence.
 
     Args:
-        model: what will adapt.
-        shown: the views it will be shown.
-        steps: fine-tuning steps that are asked for.
+        model: the model that will adapt.
+        shown: the support views.
+        steps: the requested fine-tuning steps.
     """
     found = []
     covered = _covered(shown)
     if covered > COVERED:
         what = "no alpha and no masks" if shown.masks is None else f"masks that cover {covered:.0%}"
         found.append(
-            f"the views have {what}, and the model was trained on objects over white: it takes the background for the "
-            "object; cut the object out (RGBA images, or a folder masks/), or give --learn-background"
+            f"the views have {what}, but the model was trained on objects over white, so it would treat the background "
+            "as a part of the object; cut the object out (RGBA images, or a folder masks/), or give --learn-background"
         )
     planes = model.config.network.planes
     if len(shown) < planes and len(model.known_rig):
-        stated = f"{len(shown)} views are shown and the model was trained with {planes}"
+        stated = f"{len(shown)} support views are given and the model was trained with {planes}"
         found.append(f"{stated}: some views fill several planes")
     unlike, angle = _unlikeness(model, shown)
     if unlike is not None and unlike > UNLIKE:
         found.append(
-            f"the views are unlike those of the training: their codes deviate {unlike:.1f} times as much as those did"
+            f"the views differ from those of the training: their codes deviate {unlike:.1f} times as much as those did"
             + ("" if steps or len(shown) < 2 else "; --steps 100 adapts to them")
         )
     if angle > ELSEWHERE and len(shown) >= planes:
-        found.append(f"the cameras stand {angle:.0f} degrees from where those of the training stood, on average")
+        found.append(
+            f"the directions of the cameras differ by {angle:.0f} degrees from those of the training, on average"
+        )
     return found
 
 
 def _covered(shown: Views) -> float:
-    """Mean opacity of the masks; 1 where there are none."""
+    """Mean opacity of the masks; 1 without masks."""
     return 1.0 if shown.masks is None else float(shown.masks.mean())
 
 
 def worse_than_copying(shown: Views, rendered: float, copied: float, steps: object) -> list[str]:
-    """A sentence where the pictures of a field are worse than the nearest view, copied.
+    """A warning if the pictures of a field are worse than copies of the nearest support view; otherwise no warning.
 
     Args:
-        shown: the views that it was shown.
-        rendered: PSNR of the field in decibels.
-        copied: PSNR of the nearest view.
-        steps: fine-tuning steps that were asked for; None of a baked file, which takes none.
+        shown: the support views.
+        rendered: PSNR of the field in dB.
+        copied: PSNR of the nearest view in dB.
+        steps: the requested fine-tuning steps; None for a baked file, which takes none.
     """
     if rendered >= copied:
         return []
@@ -77,20 +80,19 @@ def worse_than_copying(shown: Views, rendered: float, copied: float, steps: obje
 
 
 def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | None:
-    """PSNR of a field on support views that it was not shown, and of the nearest view copied, in one forward pass.
+    """PSNR on held-out support views: of the field after one forward pass, and of copies of the nearest view.
 
-    Pictures are those without residual correction, for which all shown views would be rendered.
-
-    Up to four views are left out, and rendered at 64 pixels. The others are shown with 256 at most.
+    Up to four views are held out and rendered with 64 pixels along the longer side; the others are given to the model
+    with at most 256 pixels. There is no residual correction, because that would render all support views.
 
     Args:
-        model: what adapts.
-        shown: the views, of which some are left out.
+        model: the model that adapts.
+        shown: the support views, of which some are held out.
 
     Returns:
-        Both figures in decibels; None with fewer than four views.
+        Both values in dB; None with fewer than FEWEST_VIEWS views.
     """
-    if len(shown) < 4:
+    if len(shown) < FEWEST_VIEWS:
         return None
     holdout = torch.linspace(0, len(shown) - 1, min(HELD_OUT, len(shown) // 2) + 2)[1:-1].round().long()
     rest = [index for index in range(len(shown)) if index not in holdout.tolist()]
@@ -103,7 +105,10 @@ def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | Non
 
 
 def _unlikeness(model: HyperPlanes, shown: Views) -> tuple[float | None, float]:
-    """Root mean square of the standardised codes, None without such, and the mean angle from the training's rig."""
+    """The root mean square of the standardised codes, or None without codes; and the mean angle to the training's rig.
+
+    The angle is in degrees, between the cameras and the planes that they fill; 0 without a rig.
+    """
     network, rig, angle = model.hypernetwork, model.known_rig.positions, 0.0
     if not len(rig) and (network is None or network.reads_volume):
         return None, angle

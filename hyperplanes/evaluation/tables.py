@@ -1,4 +1,4 @@
-"""Scores of several methods as a table: text, CSV, Markdown and JSON."""
+"""Tables of the scores of several methods, as text, CSV, Markdown and JSON."""
 
 from __future__ import annotations
 
@@ -12,20 +12,23 @@ from hyperplanes.utilities.tables import csv_table, markdown_table
 __all__ = ["PAIR_HEADINGS", "as_csv", "as_json", "as_markdown", "compared_rows", "headings", "rows"]
 
 PAIR_HEADINGS = ("paired over objects, PSNR", "difference", "95 % interval", "p")
-"""Those of `compared_rows`."""
+"""The headings of `compared_rows`."""
 
 COLUMNS = {"psnr": "PSNR", "psnr_foreground": "inside mask", "psnr_pooled": "pooled", "ssim": "SSIM", "lpips": "LPIPS"}
 
 
 def headings(scores: Sequence[Score]) -> list[str]:
-    """Those of `rows`: of the numbers that every method has."""
+    """The headings of `rows`, for the numbers that every method has."""
     found = ["method", "PSNR", "over objects"]
     found += [label for name, label in COLUMNS.items() if name != "psnr" and _all_have(scores, name)]
     return [*found, "to adapt", "to render a view"]
 
 
 def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
-    """The table as text, one row a method; ± is over seeds, "over objects" the standard deviation over them."""
+    """The rows of the table as text, one per method.
+
+    ± is the standard deviation over seeds; "over objects" is that over objects.
+    """
     table = []
     for score in scores:
         row = [score.method, _shown(score, "psnr"), f"± {score.spread('psnr'):.2f} dB"]
@@ -47,7 +50,7 @@ def _shown(score: Score, quantity: str) -> str:
 
 
 def compared_rows(pairs: Sequence[Comparison]) -> list[tuple[str, ...]]:
-    """Pairs of methods as text."""
+    """The rows of the table of pairs of methods as text, under PAIR_HEADINGS."""
     return [
         (
             f"{pair.first} - {pair.second}",
@@ -60,7 +63,7 @@ def compared_rows(pairs: Sequence[Comparison]) -> list[tuple[str, ...]]:
 
 
 def as_json(scores: Sequence[Score], pairs: Sequence[Comparison]) -> Mapping[str, object]:
-    """What `--json` writes: the numbers by method, and under "differences" those to the methods that are worse."""
+    """The content of the file of `--json`: numbers by method, with "differences" to the methods that are worse."""
     table = {score.method: score.as_json() for score in scores}
     for pair in pairs:
         table[pair.first].setdefault("differences", {})[pair.second] = pair.as_json()
@@ -68,7 +71,7 @@ def as_json(scores: Sequence[Score], pairs: Sequence[Comparison]) -> Mapping[str
 
 
 def as_csv(scores: Sequence[Score]) -> str:
-    """A line a method, seed and object, with every number that was measured."""
+    """One line per method, seed and object, with every number that was measured."""
     lines = [
         (score.method, seed, each.name, *(getattr(each, name) for name in QUANTITIES))
         for score in scores
@@ -82,9 +85,9 @@ def as_markdown(scores: Sequence[Score], pairs: Sequence[Comparison], about: str
     """The tables of methods and of their pairs.
 
     Args:
-        scores: of the methods.
-        pairs: of them; none leaves their table out.
-        about: a line below the tables, on what they were measured.
+        scores: the scores of the methods.
+        pairs: the comparisons of pairs; if empty, their table is left out.
+        about: a line below the tables, on the data that was evaluated.
     """
     text = markdown_table(headings(scores), rows(scores))
     if pairs:

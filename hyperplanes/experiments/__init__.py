@@ -1,4 +1,4 @@
-"""The tables and figures of the HyperPlanes paper, each as data and all run by one engine."""
+"""The tables and figures of the HyperPlanes paper, described as data and run by one engine."""
 
 from hyperplanes.experiments.scales import SCALES
 from hyperplanes.experiments.tables import EXPERIMENTS, find_experiment, find_experiments

@@ -1,4 +1,4 @@
-"""The configuration of a training: a preset, what the experiment changes, what the scale changes."""
+"""The configuration of a training: a preset with the changes of the experiment and of the scale."""
 
 from __future__ import annotations
 
@@ -20,10 +20,14 @@ Value = TypeVar("Value")
 
 
 def change(value: Value, changes: Mapping[str, object]) -> Value:
-    """A dataclass with some entries changed, by their dotted names; entries of a part that is None are left out.
+    """A copy of a dataclass with some entries changed.
+
+    Args:
+        value: the dataclass.
+        changes: the new values by dotted names; entries of a part that is None are ignored.
 
     Raises:
-        ValueError: no such entry.
+        ValueError: an unknown entry.
     """
     parts: dict[str, dict[str, object]] = {}
     for name, new in changes.items():
@@ -42,17 +46,17 @@ def change(value: Value, changes: Mapping[str, object]) -> Value:
 
 
 def configuration(experiment: Experiment, trained: Trained, scale: Scale, objects: int, seed: int) -> Preset:
-    """Model and training of one model of an experiment.
+    """The configuration of one training of an experiment.
 
     Args:
-        experiment: which decides the preset and the paper's epochs.
-        trained: the model.
-        scale: how large.
-        objects: that it is trained on; an epoch is a step of each.
-        seed: of the training.
+        experiment: the experiment, which determines the preset and the paper's epochs.
+        trained: the training.
+        scale: the scale of the experiment.
+        objects: the number of training objects; an epoch has one step for each.
+        seed: the seed of the training.
 
     Returns:
-        A preset that nobody has named.
+        The configuration of the model and of its training.
     """
     learned = trained.method in LEARNED
     chosen = scaled_preset(experiment, scale).by_method(trained.method, scale.learned_target if learned else None)
@@ -69,19 +73,19 @@ def configuration(experiment: Experiment, trained: Trained, scale: Scale, object
 
 
 def scaled_preset(experiment: Experiment, scale: Scale) -> Preset:
-    """The preset of an experiment with what the scale changes, before a method is chosen."""
+    """The preset of an experiment with the changes of the scale, before a method is chosen."""
     return change(preset(scale.presets[experiment.size]), scale.changes).by_protocol(scale.protocol)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """A setting that is not everywhere as it is here.
+    """A setting for which a source states another value than the one used here.
 
     Attributes:
-        kind: of method: "HyperPlanes", "fine-tuning" or "learned initialisations".
-        entry: the setting.
-        here: its value.
-        sources: what each of `published.SOURCES` states, in their order; "-" where it states nothing.
+        kind: the kind of method: "HyperPlanes", "fine-tuning" or "learned initialisations".
+        entry: the dotted name of the setting.
+        here: the value used here.
+        sources: the values that `published.SOURCES` state, in that order; "-" if a source states none.
     """
 
     kind: str
@@ -91,7 +95,7 @@ class Difference:
 
     @property
     def row(self) -> list[str]:
-        """For tables."""
+        """The cells of a table, under DIFFERENCE_HEADINGS."""
         return [self.kind, self.entry, self.here, *self.sources]
 
 
@@ -99,15 +103,17 @@ DIFFERENCE_HEADINGS = ("of", "setting", "here", *(source.name for source in SOUR
 
 
 def differences(experiment: Experiment, scale: Scale) -> list[Difference]:
-    """The settings of an experiment that a source states otherwise; of what no source states there is nothing to say.
+    """The settings of an experiment for which a source states another value.
+
+    Only HyperPlanes, their fine-tuning and learned initialisations are compared: no source states settings of
+    MultiPlaneNeRF, of the autoencoder or of a NeRF from random weights.
 
     Args:
-        experiment: whose kinds of methods are compared: HyperPlanes, their fine-tuning, learned initialisations. Of
-            MultiPlaneNeRF, of the autoencoder and of a NeRF from random weights no source states settings of its own.
-        scale: that it is run at.
+        experiment: the experiment.
+        scale: its scale.
 
     Returns:
-        In the order of the sources' tables; what the experiment varies on purpose is not among them.
+        The differences, in the order of the facts of the sources, without settings that the experiment varies.
     """
     varied = {name for trained in experiment.trainings for name in trained.changes}
     found = []
@@ -123,7 +129,7 @@ def differences(experiment: Experiment, scale: Scale) -> list[Difference]:
 
 
 def _settings(experiment: Experiment, scale: Scale) -> dict[str, dict[str, object]]:
-    """The settings of each kind of method that an experiment has, by their dotted names."""
+    """By each kind of method in an experiment, its settings by their dotted names."""
     found: dict[str, dict[str, object]] = {}
     for cell in experiment.cells:
         method, tuning = cell.trained.method, re.fullmatch(r"hyperplanes_\d+", cell.method)

@@ -1,4 +1,4 @@
-"""The data sets of an experiment: given ones, and those that are generated at its scale."""
+"""The data sets of an experiment: some are given, and the others are generated at its scale."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ __all__ = ["DataSets"]
 
 
 class DataSets:
-    """Objects by class, each data set opened once, and generated where none was given.
+    """Data sets by class. Each is opened once; classes without a given data set are generated.
 
     Args:
-        workspace: the folder in which they are generated.
-        scale: how many objects and views, and how large.
-        generate: called with what decides a data set and the folder it is to lie in; goes on where it stopped.
-        device: where views are kept.
-        given: folders by class, instead of generated data sets.
-        legacy: as in `open_dataset`, of given ones.
+        workspace: the folder in which data sets are generated.
+        scale: the scale of the experiment, with the numbers of objects and views and the size of images.
+        generate: called with the settings of a data set and its folder; it resumes an interrupted generation.
+        device: the device of the views.
+        given: folders of given data sets by class.
+        legacy: as in `open_dataset`, for given data sets.
     """
 
     def __init__(
@@ -45,12 +45,12 @@ class DataSets:
     ) -> None:
         self.workspace, self.scale, self.generate, self.device = workspace, scale, generate, device
         self.given, self.legacy = given or {}, legacy
-        self.generated: dict[str, Path] = {}  # by another process, whose worker this one is
+        self.generated: dict[str, Path] = {}  # data sets that the parent of a worker process has generated
         self._tasks: dict[str, TasksOnDevice] = {}
-        self._names: dict[str, str] = {}  # of given data sets: what they hold is looked at once
+        self._names: dict[str, str] = {}  # names of given data sets, whose checksums are computed once
 
     def tasks(self, class_name: str) -> Tasks:
-        """The data set of a class; ValueError where none was given and the scale generates none."""
+        """The data set of a class; ValueError if none was given and the scale generates none."""
         if class_name not in self._tasks:
             folder = self.folder(class_name)
             data: Tasks = open_dataset(folder, legacy=self.legacy and class_name in self.given)
@@ -60,7 +60,7 @@ class DataSets:
         return self._tasks[class_name]
 
     def folder(self, class_name: str) -> Path:
-        """The folder of the data set of a class; as `tasks`."""
+        """The folder of the data set of a class, which is generated if necessary; ValueError as for `tasks`."""
         if class_name in self.given:
             return self.given[class_name].resolve()
         if class_name in self.generated:
@@ -70,7 +70,7 @@ class DataSets:
         return self.workspace.folder("data", class_name, self.name(class_name), settings, work)
 
     def name(self, class_name: str) -> str:
-        """What tells the data set of a class from others: a name, of a given one its folder, with a checksum."""
+        """A unique name of the data set of a class: the class, or the folder of a given one, with a checksum."""
         if class_name in self.given:
             if class_name not in self._names:
                 folder = self.given[class_name].resolve()
@@ -79,17 +79,17 @@ class DataSets:
         return unique_name(class_name, self._settings(class_name))
 
     def evaluated(self, class_name: str, split: str, most: int | None = None) -> list[str]:
-        """The objects of a class that are evaluated, `most` at the most; ValueError where there are none."""
+        """The objects of a class that are evaluated, at most `most`; ValueError if there are none."""
         found = list(self.tasks(class_name).names(split))
         if not found:
             raise ValueError(f"data: expected {class_name} objects in the {split} split, got none")
-        if split == "train" and self.scale.held_out:  # as many as held-out ones
+        if split == "train" and self.scale.held_out:  # as many training objects as held-out objects
             found = found[: self.scale.held_out]
         return found[: self.scale.evaluated][:most]
 
     @property
     def reading(self) -> dict[str, Any]:
-        """How data sets are read, where it is not the usual way; JSON-able."""
+        """The settings of reading data sets that are not the defaults, as values for JSON."""
         bounds = {} if self.scale.bounds is None else {"bounds": asdict(self.scale.bounds)}
         return ({"legacy": True} if self.legacy else {}) | bounds
 
@@ -97,8 +97,8 @@ class DataSets:
         scale = self.scale
         if scale.resolution is None:
             raise ValueError(
-                f"data: expected --data {class_name}=FOLDER, as the scale {scale.name} takes data sets as they were "
-                "published, got none; or take --scale small"
+                f"data: expected --data {class_name}=FOLDER, because the scale {scale.name} needs the published data "
+                "sets, got none; or give --scale small"
             )
         sizes = {name: getattr(scale, name) for name in ("resolution", "objects", "held_out", "views")}
         return {"class": class_name, **sizes, **scale.data.get(class_name, {})}

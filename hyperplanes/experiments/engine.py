@@ -1,4 +1,4 @@
-"""Runs an experiment: its trainings, and evaluations by them, each made once and kept in a workspace."""
+"""Runs an experiment: its trainings, and the evaluations of their models. The results are kept in a workspace."""
 
 from __future__ import annotations
 
@@ -35,26 +35,26 @@ from hyperplanes.views import Task, Tasks
 
 __all__ = ["ORBIT", "Curve", "OnScore", "Outcome", "Runner", "curve_of", "file_name"]
 
-ORBIT = "orbit"  # in the folder of an object's pictures: views on a circle around it
+ORBIT = "orbit"  # folder, among the pictures of an object, of views on a circle around it
 
 Curve = list[dict[str, float]]
 
 OnScore = Callable[[Cell, int, ObjectScore, int, int], object]
-"""Called with a cell, a seed, what was found of an object, how many of its objects are done, and how many there are."""
+"""Called with a cell, a seed, the score of an object, and the number of the cell's objects that are done and in all."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an experiment has found.
+    """The results of an experiment.
 
     Attributes:
-        experiment: what was run.
-        scale: how large.
-        scores: by (row, column), over all seeds.
-        curves: of the trainings, by row and then by seed.
-        seeds: how many.
-        objects: trained on, by class; none where every model is packaged.
-        given: classes whose data sets were given, and not generated.
+        experiment: the experiment.
+        scale: its scale.
+        scores: the scores by (row, column), over all seeds.
+        curves: the curves of the trainings by row, or by column if there are several, one per seed.
+        seeds: the number of seeds.
+        objects: the number of training objects by class; empty if every model is packaged.
+        given: the classes whose data sets were given, not generated.
     """
 
     experiment: Experiment
@@ -68,7 +68,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """An object by the method of a cell: by what training, with which seed."""
+    """The evaluation of one object by the method of a cell, with the checkpoint and the seed."""
 
     experiment: Experiment
     cell: Cell
@@ -78,17 +78,17 @@ class Evaluation:
 
 
 class Runner:
-    """Evaluates what an experiment asks for, by its `trainings`; each once with the same settings.
+    """Runs the trainings and evaluations of experiments, each once for the same settings.
 
-    Evaluations lie in a workspace under names that hold a checksum of all that decides them: after an interruption the
-    same call goes on.
+    Evaluations are files in a workspace, whose names contain a checksum of all settings on which they depend. To resume
+    after an interruption, make the same call again.
 
     Args:
-        workspace: the folder for everything.
-        data: the data sets, and how large everything is.
-        train: makes a training.
-        device: where to compute.
-        workers: processes in which trainings run side by side and objects are evaluated; this one where absent.
+        workspace: the folder for all results.
+        data: the data sets; they also have the scale.
+        train: runs a training.
+        device: the device to compute on.
+        workers: processes that run trainings side by side and evaluate objects; by default this process does so.
     """
 
     def __init__(
@@ -103,19 +103,19 @@ class Runner:
         self.workspace, self.data, self.scale, self.device = workspace, data, data.scale, device
         self.workers = workers
         self.trainings = Trainings(workspace, data, train, workers)
-        self._evaluated: dict[Path, Future[ObjectScore]] = {}  # by workers, by the files that they go to
+        self._evaluated: dict[Path, Future[ObjectScore]] = {}  # evaluations by workers, by their files
         self._method_in_use: tuple[object, tuple[Unchecked, Tasks]] | None = None
 
     def run(self, experiment: Experiment, seeds: int, on_score: OnScore = lambda *_: None) -> Outcome:
-        """All trainings and evaluations of an experiment.
+        """Run all trainings and evaluations of an experiment.
 
         Args:
-            experiment: which.
-            seeds: how many, from 0: each is that of a training and of the fine-tuning of its evaluations.
+            experiment: the experiment.
+            seeds: the number of seeds, from 0. Each is the seed of a training and of the fine-tuning of its model.
             on_score: as in `score`.
 
         Returns:
-            All that tables and figures are made of.
+            The results, for tables and figures.
         """
         scores: dict[tuple[str, str], list[Score]] = {}
         curves: dict[str, dict[tuple[str, int], Curve]] = {}
@@ -124,7 +124,7 @@ class Runner:
             self.start(experiment, seed)
             for cell in experiment.cells:
                 if cell.trained.packaged and seed:
-                    continue  # the same whatever the seed
+                    continue  # a packaged model does not depend on the seed
                 folder = self.trainings.folder(experiment, cell.trained, seed)
                 curves.setdefault(_curve_name(experiment, cell), {})[str(folder), seed] = curve_of(folder)
                 scores.setdefault((cell.row, cell.column), []).append(self.score(experiment, cell, seed, on_score))
@@ -139,22 +139,22 @@ class Runner:
         )
 
     def train_all(self, experiment: Experiment, seed: int, evaluated: Sequence[Experiment] = ()) -> None:
-        """The trainings of an experiment, and beside the last of them what can be evaluated already.
+        """Run the trainings of an experiment. Workers that have nothing left to train begin with evaluations.
 
         Args:
-            experiment: which.
-            seed: of the trainings.
-            evaluated: what workers that have nothing left to train begin with, as by `start`.
+            experiment: the experiment.
+            seed: the seed of the trainings.
+            evaluated: the experiments of these evaluations, as in `start`.
         """
         self.trainings.make_all(experiment, seed, lambda: [self.start(each, seed) for each in evaluated])
 
     def score(self, experiment: Experiment, cell: Cell, seed: int, on_score: OnScore = lambda *_: None) -> Score:
-        """The evaluation of a cell with one seed, kept object by object.
+        """The score of a cell with one seed. The score of each object is written to a file.
 
         Args:
-            experiment: which.
-            cell: of it.
-            seed: of the training and of fine-tuning.
+            experiment: the experiment.
+            cell: a cell of it.
+            seed: the seed of the training and of fine-tuning.
             on_score: called after every object that was not evaluated before.
         """
         objects: list[ObjectScore] = []
@@ -163,7 +163,7 @@ class Runner:
             if known is None:
                 self.workspace.begin()
                 if _is_time(cell):
-                    wait(self._evaluated.values())  # workers slow down what is measured beside them
+                    wait(self._evaluated.values())  # running workers would slow down what is measured
                 started = self._evaluated.pop(path, None)
                 found = self.evaluate(job) if started is None else started.result()
                 known = Score(method, (found,))
@@ -173,9 +173,9 @@ class Runner:
         return Score(method, tuple(objects))
 
     def start(self, experiment: Experiment, seed: int) -> None:
-        """Have the workers, if any, evaluate what `score` will be asked for, as far as trainings are done.
+        """Let the workers, if any, begin the evaluations for `score` of those models whose training is done.
 
-        What a time is asked of is evaluated by this process, alone.
+        Cells whose quantity is a time are evaluated by this process, while no worker is running.
         """
         if self.workers is None:
             return
@@ -187,11 +187,11 @@ class Runner:
                     self._evaluated[path] = self.workers.submit(self._folders(cell.on), partial(_evaluate, job))
 
     def do_all(self, class_name: str, works: Sequence[Callable[[Runner], Result]]) -> list[Result]:
-        """What pieces of work return, side by side where there are workers.
+        """The results of functions, which run side by side if there are workers.
 
         Args:
-            class_name: of the data set that they read.
-            works: each called with the runner of its process; pickled where there are workers.
+            class_name: the class of the data set that they read.
+            works: functions of the runner of their process; they are pickled if there are workers.
         """
         if self.workers is None:
             return [work(self) for work in works]
@@ -201,7 +201,7 @@ class Runner:
     def _evaluations(
         self, experiment: Experiment, cell: Cell, seed: int
     ) -> Generator[tuple[Evaluation, dict[str, Any], Path, Score | None]]:
-        """Of every object of a cell: what is to be done, all that decides it, its file, and what is known already."""
+        """For every object of a cell: the evaluation, all settings of it, its file, and the score if that is known."""
         checkpoint = self.trainings.folder(experiment, cell.trained, seed)
         method = self.scale.method(cell.method)
         shared = {
@@ -229,7 +229,7 @@ class Runner:
             yield Evaluation(experiment, cell, checkpoint, seed, name), settings, path, score
 
     def evaluate(self, job: Evaluation) -> ObjectScore:
-        """One object by the method of a cell; its pictures are written where they are kept."""
+        """The score of one object by the method of a cell. If the experiment keeps pictures, they are written."""
         experiment, cell = job.experiment, job.cell
         made_for = (experiment.name, cell, job.checkpoint, job.seed)
         method = self.scale.method(cell.method)
@@ -239,31 +239,31 @@ class Runner:
         return evaluate(method, *self._method_in_use[1], [job.name], keep).objects[0]
 
     def _measured_by(self) -> dict[str, Any]:
-        """What decides how long an evaluation takes in this process."""
+        """The device and the number of threads of this process, on which measured times depend."""
         on_gpu = self.device.type == "cuda"
         name = torch.cuda.get_device_name(self.device) if on_gpu else find_processor()
         return {"device": name, "threads": torch.get_num_threads()}
 
     def _folders(self, class_name: str) -> dict[str, Path]:
-        """The data set of a class, for a worker, which generates none."""
+        """The folder of the data set of a class, for a worker, because workers do not generate data sets."""
         return {class_name: self.data.folder(class_name)}
 
     def _evaluation(self, cell: Cell, settings: Mapping[str, Any]) -> Path:
-        """The file of what a cell found of an object."""
+        """The file of the score of an object in a cell."""
         if self.workspace.places is not None:
             return self.workspace.out / "scores" / cell.column / file_name(cell.row) / f"{settings['object']}.json"
         start = f"{Path(settings['on']).name}-{settings['method']}-{settings['seed']}"
         return self.workspace.out / "evaluations" / f"{unique_name(start, settings)}.json"
 
     def pictures(self, cell: Cell, name: str) -> Path:
-        """The folder of the query views of an object, as a cell shows them, where they are kept.
+        """The folder of the rendered query views of an object in a cell, for experiments that keep pictures.
 
         Views on a circle are in its folder ORBIT.
         """
         return self.workspace.out / "pictures" / cell.column / file_name(cell.row) / name
 
     def picture(self, experiment: Experiment, cell: Cell) -> tuple[Tensor, Tensor]:
-        """The first query view of the first object of a cell: the truth, and what the method shows; (3, h, w)."""
+        """The first query view of the first object of a cell: the true image and the method's picture, (3, h, w)."""
         checkpoint = self.trainings.folder(experiment, cell.trained, 0)
         adapter, tasks = self._method(experiment, cell, self.scale.method(cell.method), checkpoint, 0)
         task = tasks.task(self.data.evaluated(cell.on, cell.split, experiment.objects)[0])
@@ -273,7 +273,7 @@ class Runner:
     def _method(
         self, experiment: Experiment, cell: Cell, method: str, checkpoint: Path, seed: int
     ) -> tuple[Unchecked, Tasks]:
-        """The adapter of a cell, and the objects with as many support views as it shows."""
+        """The adapter of a cell, and the objects with the cell's number of support views."""
         checkpoints = find_checkpoints([checkpoint])
         trainable = cell.trainable if "hyperplanes" in checkpoints else "weights"
         settings = replace(self.fine_tuning(cell), trainable=trainable, seed=seed)
@@ -291,9 +291,10 @@ class Runner:
         return Unchecked(make_method(request)), tasks
 
     def fine_tuning(self, cell: Cell) -> FineTuning:
-        """Rays, optimiser and rates of the gradient steps of a cell; a learned initialisation states its own.
+        """The settings of the gradient steps of a cell. A learned initialisation has its own and gets the defaults.
 
-        What a scale has for the hypernetwork alone is not for all weights: these are fine-tuned as by `render`.
+        If the scale has settings for the hypernetwork alone, cells that fine-tune all weights get the defaults, as in
+        `render`.
         """
         for_all_weights = self.scale.fine_tuning.trainable == "weights"
         if cell.trained.method in LEARNED or (cell.trainable == "weights" and not for_all_weights):
@@ -301,31 +302,31 @@ class Runner:
         return self.scale.scratch if "_scratch_" in cell.method else self.scale.fine_tuning
 
     def _views(self, cell: Cell, checkpoint: Path) -> int:
-        """How many support views a cell shows: as many as the model has planes, where it does not say."""
+        """The number of support views of a cell; by default the number of planes of the model."""
         if cell.views is not None:
             return self.scale.planes(cell.views)
         return int(read_json(checkpoint / "model.json")["network"]["planes"])
 
 
 def stated(settings: FineTuning) -> dict[str, Any]:
-    """What settings state otherwise than the defaults."""
+    """The settings that differ from the defaults, by name."""
     usual = asdict(FineTuning())
     return {name: value for name, value in asdict(settings).items() if value != usual[name]}
 
 
 def curve_of(checkpoint: Path) -> Curve:
-    """What was measured while a model was trained; nothing of a packaged one."""
+    """The curve of the training of a model; empty for a packaged model."""
     state = checkpoint / "training.json"
     return read_json(state).get("curve", []) if state.exists() else []
 
 
 def file_name(row: str) -> str:
-    """The heading of a row in file names."""
+    """The name of a folder for the heading of a row."""
     return row.replace(":", "-on-")
 
 
 def _is_time(cell: Cell) -> bool:
-    """Whether a cell asks for seconds, which this process measures while no other one works for it."""
+    """Whether the quantity of a cell is a time, which is measured in this process while no worker is running."""
     return cell.quantity.endswith("seconds")
 
 
@@ -342,5 +343,5 @@ def _save_pictures(
 
 
 def _curve_name(experiment: Experiment, cell: Cell) -> str:
-    """What a training is called in a figure: the row or the column that tells it from others."""
+    """The name of a training in a figure: its column if there are several, otherwise its row."""
     return cell.column if len(experiment.columns) > 1 else cell.row

@@ -1,4 +1,4 @@
-"""How long an experiment will take, from a few measured steps of each of its models."""
+"""An estimate of the time that an experiment will take, from a few measured steps of each of its trainings."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from hyperplanes.utilities.timing import clock
 
 __all__ = ["Estimate", "estimate"]
 
-STEPS = 2  # measured, after one that is not
-SIDE = 32  # pixels of the view that is rendered
+STEPS = 2  # measured steps, after one that is not measured
+SIDE = 32  # pixels along a side of the view that is rendered
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Estimate:
     """The time of all trainings and evaluations of an experiment on this machine.
 
     Attributes:
-        rows: a line a model, as text.
-        seconds: of all of it.
-        headings: of the rows.
+        rows: one row of text per training.
+        seconds: the time of everything.
+        headings: the headings of the rows.
     """
 
     rows: Sequence[tuple[str, ...]]
@@ -37,16 +37,16 @@ class Estimate:
 
 
 def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
-    """Take a few steps of every training and render a small view with its field.
+    """Estimate the time of an experiment: take a few steps of every training and render a small view with its field.
 
     Args:
-        runner: with the data sets.
-        experiment: which.
-        seeds: of every training and evaluation.
+        runner: a runner with the data sets.
+        experiment: the experiment.
+        seeds: the number of seeds of every training and evaluation.
 
     Returns:
-        The time of all trainings, those that others refer to among them, and of evaluations but those of packaged
-        models, whatever of them is done already.
+        The time of all trainings, including those that others read, and of all evaluations except those of packaged
+        models. Work that is already done is included.
     """
     rows, whole = [], 0.0
     references = [each.reference for each in experiment.trainings if each.reference is not None]
@@ -83,7 +83,7 @@ def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:
 
 @dataclass(frozen=True)
 class _Measured:
-    """Seconds of a training step and of a rendered pixel, and the rays a second of the former."""
+    """Seconds of a training step and of a rendered pixel, and the rays per second of training."""
 
     step: float
     pixel: float
@@ -92,7 +92,7 @@ class _Measured:
 
 def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measured:
     trainer = _trainer(runner, experiment, trained)
-    trainer.loader.names = trainer.loader.names[: trainer.config.tasks]  # made ready by the first step
+    trainer.loader.names = trainer.loader.names[: trainer.config.tasks]  # the first step prepares all of these
     trainer.take_step()
     started = clock()
     for _ in range(STEPS):
@@ -101,7 +101,7 @@ def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measu
     task = trainer.data.task(trainer.loader.names[0])
     field = trainer.model.adapt(task.support)
     view = camera.resized(camera.select(task.query.cameras, [0]), SIDE, SIDE)
-    field.render(view)  # what is empty is found once an object
+    field.render(view)  # the first call finds the occupied voxels, once per object
     started = clock()
     field.render(view)
     return _Measured(step, (clock() - started) / SIDE**2, trainer.objective.rays_per_step / step)

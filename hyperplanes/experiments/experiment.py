@@ -1,4 +1,4 @@
-"""What an experiment of the paper is made of: trainings, cells, and the table or figure that they fill."""
+"""The parts of an experiment of the paper: trainings, cells, and the table or figure of these cells."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from hyperplanes.experiments.published import PublishedTable
 __all__ = ["ALL_PLANES", "Cell", "Experiment", "Split", "Trained"]
 
 Split = Literal["test", "train", "all"]
-"""Which objects of a class are evaluated."""
+"""The objects of a class that are evaluated."""
 
-ALL_PLANES = 25  # support views of an object in all of the paper's experiments but one
+ALL_PLANES = 25  # support views per object in all of the paper's experiments but one
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What is trained.
+    """One training.
 
     Attributes:
-        on: the class of its objects.
-        method: as `train --method` names it.
-        changes: entries of the configuration by their dotted names, such as "model.hypernetwork.views".
-        planes: of the target network; more than 25 only where support and query views are one set.
-        reference: the training whose result this one reads, as "mv_matched" does that of "mv_meta".
-        packaged: the name of a model that comes with the package and is not trained here; empty where it is.
+        on: the class of the training objects.
+        method: the method, as in `train --method`.
+        changes: changed entries of the configuration by their dotted names, such as "model.hypernetwork.views".
+        planes: the number of planes of the target network; more than 25 only if support and query views are one set.
+        reference: the training whose result this one reads, as "mv_matched" reads that of "mv_meta".
+        packaged: the name of a packaged model, which is not trained; otherwise empty.
     """
 
     on: str
@@ -42,18 +42,20 @@ class Cell:
     """One number of a table.
 
     Attributes:
-        row: its heading.
-        column: its heading.
-        trained: the model.
-        method: as `evaluate --method` names it.
+        row: the heading of its row.
+        column: the heading of its column.
+        trained: the training of the model.
+        method: the method, as in `evaluate --method`.
         on: the class of the objects that it is evaluated on.
-        split: which of them.
-        quantity: a number of `evaluation.ObjectScore`.
-        trainable: what fine-tuning optimises; "hypernetwork" with theta frozen is the paper's way.
-        views: support views that are shown; as many as the model has planes where None.
-        query: query views that are kept back, where the views that are shown are chosen as far apart as all of them
-            stand; all query views where None, and the first support views are shown.
-        orbit: views on a circle around each object that are kept as files, where pictures are.
+        split: the objects of this class that are evaluated.
+        quantity: the name of a number of `evaluation.ObjectScore`.
+        trainable: what fine-tuning optimises. The paper optimises the hypernetwork while theta is frozen.
+        views: the number of support views; None for as many as the model has planes.
+        query: the number of query views, if the support views are those of the other views that are farthest apart
+            (`data.support.Shown`). With None, the support views are the first ones of the data set, and all query views
+            are evaluated.
+        orbit: the number of views on a circle around each object that are written to files, if the experiment keeps
+            pictures.
     """
 
     row: str
@@ -74,21 +76,21 @@ class Experiment:
     """A table or a figure of the paper.
 
     Attributes:
-        name: what `reproduce` calls it.
-        title: in words.
+        name: its name for `reproduce`.
+        title: its title.
         where: its labels in the paper's LaTeX source.
-        size: pixels a side of the paper's images: 128 or 200.
-        epochs: of the paper's trainings, by class; a number for all of them.
-        runs: with other seeds, in the paper; None where it does not say how many.
-        cells: row by row.
+        size: pixels along a side of the paper's images: 128 or 200.
+        epochs: the epochs of the paper's trainings by class, or one number for all classes.
+        runs: the number of the paper's runs with different seeds; None if the paper does not state it.
+        cells: the cells, row by row.
         figure: "bars" of the table, "curves" of the trainings, "boxes" over seeds and objects, or "steps": PSNR over
-            the numbers of steps in the columns' headings.
-        published: the paper's numbers; None where the paper only has a picture.
-        notes: what the paper says in words, leaves open or says twice.
-        objects: evaluated a class; None for all.
-        published_rows: headings of the paper's rows by ours, where ours say more.
-        pictures: rows of which a view is shown by every method, beside the truth; none where empty.
-        keep_pictures: whether the query views of all cells are kept as files, where a folder is an experiment's own.
+            the numbers of steps in the headings of the columns.
+        published: the paper's numbers; None if the paper has only a picture.
+        notes: notes on what the paper states in words, does not state, or states inconsistently.
+        objects: the number of objects per class that are evaluated; None for all.
+        published_rows: the headings of the paper's rows by the headings used here, if these differ.
+        pictures: the rows for which a figure shows a view by every method, beside the truth.
+        keep_pictures: whether the rendered query views of all cells are written to files.
     """
 
     name: str
@@ -107,16 +109,17 @@ class Experiment:
     keep_pictures: bool = False
 
     def of(self, headings: Sequence[str]) -> Experiment:
-        """The same with some rows and columns alone; all of them where no heading is given.
+        """The experiment with some of its rows and columns; without headings, all of them.
 
         Args:
-            headings: of rows, columns or both.
+            headings: headings of rows, of columns or of both.
 
         Returns:
-            The cells whose row or column, or of headings of both kinds whose row and column, are among them.
+            The experiment with the cells in these rows and these columns. If there are no headings of one kind, all
+            rows or all columns are kept.
 
         Raises:
-            ValueError: a heading that the table has not, or headings of which no cell has two.
+            ValueError: an unknown heading, or headings of rows and columns that have no cell in common.
         """
         known = [*self.rows, *self.columns]
         if unknown := [each for each in headings if each not in known]:
@@ -130,20 +133,20 @@ class Experiment:
         return replace(self, cells=kept, pictures=tuple(each for each in self.pictures if each in rows))
 
     def published_value(self, row: str, column: str) -> float | None:
-        """The paper's number beside a cell; None where it has none."""
+        """The paper's number for a cell; None if it has none."""
         return None if self.published is None else self.published.value(self.published_row(row), column)
 
     def published_deviation(self, row: str, column: str) -> float | None:
-        """Its standard deviation; None where the paper has none."""
+        """The standard deviation of the paper's number; None if it has none."""
         return None if self.published is None else self.published.deviation(self.published_row(row), column)
 
     def published_row(self, row: str) -> str:
-        """The heading of the paper's row beside ours; empty where it has none."""
+        """The heading of the paper's row for a row of this experiment; empty if the paper has none."""
         return self.published_rows.get(row, "") if self.published_rows else row
 
     @property
     def trainings(self) -> list[Trained]:
-        """What is trained, each once."""
+        """The different trainings, in the order of the cells."""
         found: list[Trained] = []
         for cell in self.cells:
             if cell.trained not in found:
@@ -152,19 +155,19 @@ class Experiment:
 
     @property
     def classes(self) -> list[str]:
-        """The classes whose objects are needed."""
+        """The classes of all training and evaluated objects."""
         return list(dict.fromkeys(each for cell in self.cells for each in (cell.trained.on, cell.on)))
 
     @property
     def rows(self) -> list[str]:
-        """The headings of the rows in their order."""
+        """The headings of the rows, in their order."""
         return list(dict.fromkeys(cell.row for cell in self.cells))
 
     @property
     def columns(self) -> list[str]:
-        """The headings of the columns in their order."""
+        """The headings of the columns, in their order."""
         return list(dict.fromkeys(cell.column for cell in self.cells))
 
     def epochs_of(self, class_name: str) -> int:
-        """The paper's epochs on a class."""
+        """The epochs of the paper's training on a class."""
         return self.epochs if isinstance(self.epochs, int) else self.epochs[class_name]

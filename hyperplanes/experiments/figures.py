@@ -1,4 +1,4 @@
-"""The figure of an experiment."""
+"""The figures of an experiment."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ AXES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "image_seconds": "seconds a view"}
 
 
 def figure_of(outcome: Outcome) -> Figure:
-    """The figure that the experiment asks for: bars, curves, boxes or PSNR over steps."""
+    """The figure of the experiment, of the kind that it states: bars, curves, boxes or PSNR over steps."""
     draw = {"bars": _bars, "curves": _curves, "boxes": _boxes, "steps": _steps}[outcome.experiment.figure]
     return _titled(draw(outcome), outcome)
 
@@ -32,7 +32,7 @@ def _titled(figure: Figure, outcome: Outcome) -> Figure:
 
 
 def _bars(outcome: Outcome) -> Figure:
-    """Ours in the upper half, the paper's in the lower one, rows as groups."""
+    """Bars grouped by row: the results in the upper half, the paper's numbers in the lower half."""
     experiment, published = outcome.experiment, outcome.experiment.published
     cells = {(cell.row, cell.column): cell for cell in experiment.cells}
     figure = new_figure(max(6.0, 1.3 * len(experiment.rows) + 2), 6.5 if published else 3.5)
@@ -63,12 +63,12 @@ def _bars(outcome: Outcome) -> Figure:
 
 
 def curves_of(outcome: Outcome) -> Figure | None:
-    """PSNR, SSIM and loss while training, beside a figure of boxes, as the paper has them; None beside others."""
+    """PSNR, SSIM and loss during training, for experiments with a figure of boxes, as in the paper; otherwise None."""
     return _titled(_curves(outcome), outcome) if outcome.experiment.figure == "boxes" else None
 
 
 def pictures_of(runner: Runner, outcome: Outcome) -> Figure | None:
-    """A view of the first object of some rows by every method, beside the truth; None where no row is to be shown."""
+    """A view of the first object of each row in `pictures`, by every method, beside the truth; None without any."""
     experiment = outcome.experiment
     if not experiment.pictures:
         return None
@@ -82,7 +82,7 @@ def pictures_of(runner: Runner, outcome: Outcome) -> Figure | None:
 
 
 def _curves(outcome: Outcome) -> Figure:
-    """PSNR and SSIM of held-out objects and the loss, mean over the seeds and a band of their deviation."""
+    """PSNR and SSIM of held-out objects, and the loss: means over the seeds with bands of their standard deviation."""
     figure = new_figure(14.0, 4.0)
     entries = {"psnr": "held-out PSNR (dB)", "ssim": "held-out SSIM", "loss": "loss"}
     for axes, (entry, label) in zip(figure.subplots(1, 3), entries.items(), strict=True):
@@ -108,7 +108,7 @@ def _over_seeds(curves: Sequence[Curve], entry: str) -> tuple[list[tuple[float, 
 
 
 def _boxes(outcome: Outcome) -> Figure:
-    """PSNR of all objects and seeds on the left, means of the seeds on the right, a box a row."""
+    """PSNR of all objects and seeds on the left, means of the seeds on the right, with one box per row."""
     figure = new_figure(9.0, 4.0)
     column = outcome.experiment.columns[0]
     scores = {row: outcome.scores[row, column] for row in outcome.experiment.rows}
@@ -122,7 +122,7 @@ def _boxes(outcome: Outcome) -> Figure:
 
 
 def _steps(outcome: Outcome) -> Figure:
-    """PSNR over numbers of steps; what takes none is a level."""
+    """PSNR over the number of steps; a row with a single number of steps is a horizontal line."""
     experiment = outcome.experiment
     figure = new_figure(7.0, 4.0)
     axes = figure.subplots()

@@ -1,7 +1,7 @@
-"""What is published: the numbers of the paper, and what the paper, its code and learnit's say about settings.
+"""Published numbers of the paper, and published settings of the paper, of its code and of learnit.
 
 The numbers are those of HyperPlanes (arXiv 2402.01524), by the labels of its LaTeX source. A setting that a source does
-not state has no `Fact`; nothing is filled in.
+not state has no `Fact`.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ class PublishedTable:
     """A table as it is printed in the paper.
 
     Attributes:
-        label: of the table in the LaTeX source.
-        columns: their headings.
-        rows: the numbers by the heading of the row, in the order of the columns; PSNR in dB unless a row says another.
-        deviations: standard deviations of the same, where the paper has them.
+        label: the label of the table in the LaTeX source.
+        columns: the headings of the columns.
+        rows: the numbers by the heading of the row, in the order of the columns: PSNR in dB, unless the row names
+            another quantity.
+        deviations: the standard deviations of these numbers, if the paper has them.
     """
 
     label: str
@@ -42,11 +43,11 @@ class PublishedTable:
     deviations: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def value(self, row: str, column: str) -> float | None:
-        """A number; None where the paper has no such row or column."""
+        """A number; None if the paper has no such row or column."""
         return self._find(self.rows, row, column)
 
     def deviation(self, row: str, column: str) -> float | None:
-        """Its standard deviation; None where the paper has none."""
+        """The standard deviation of a number; None if the paper has none."""
         return self._find(self.deviations, row, column)
 
     def _find(self, rows: Mapping[str, tuple[float, ...]], row: str, column: str) -> float | None:
@@ -114,14 +115,14 @@ SINGLE = PublishedTable(
 
 @dataclass(frozen=True)
 class Fact:
-    """What a source states about a setting.
+    """The statement of a source about a setting.
 
     Attributes:
-        entry: the setting as this project names it, dotted, such as "model.network.depth"; "fine_tuning." and "views."
-            are those of an evaluation.
-        value: as this project would write it, or in words where it has nothing of the kind.
-        where: in the source.
-        size: pixels a side of the images that it is said of; 0 for all.
+        entry: the dotted name of the setting in this project, such as "model.network.depth". Names that begin with
+            "fine_tuning." or "views." are settings of an evaluation.
+        value: the value of the setting in this project, or a description if no value expresses it.
+        where: the place in the source.
+        size: pixels along a side of the images that it applies to; 0 for all.
     """
 
     entry: str
@@ -135,10 +136,9 @@ class Source:
     """A publication or a repository.
 
     Attributes:
-        name: heading of its column.
-        where: it is to be found.
-        facts: by the kind of the method that they are said of: "HyperPlanes", "fine-tuning" or "learned
-            initialisations".
+        name: the heading of its column.
+        where: the place where it can be found.
+        facts: the facts by the kind of method: "HyperPlanes", "fine-tuning" or "learned initialisations".
     """
 
     name: str
@@ -146,7 +146,7 @@ class Source:
     facts: Mapping[str, tuple[Fact, ...]]
 
     def fact(self, kind: str, entry: str, size: int) -> Fact | None:
-        """What it states about a setting of a kind of method at a size; None where it states nothing."""
+        """The fact about a setting of a kind of method at a size of images; None if the source states nothing."""
         found = (each for each in self.facts.get(kind, ()) if each.entry == entry and each.size in (0, size))
         return next(found, None)
 
@@ -185,7 +185,7 @@ PAPER = Source(
         "learned initialisations": (Fact("views.steps", 2000, "section 4.1: 2000 fine-tuning steps"),),
     },
 )
-"""What the paper states."""
+"""The settings that the paper states."""
 
 CODE = Source(
     "its code",
@@ -228,7 +228,7 @@ CODE = Source(
         ),
     },
 )
-"""What the authors' code does."""
+"""The settings of the authors' code."""
 
 LEARNIT = Source(
     "learnit",
@@ -257,6 +257,6 @@ LEARNIT = Source(
         ),
     },
 )
-"""What learnit does, Tancik et al. 2021, whose methods the first table compares with."""
+"""The settings of learnit (Tancik et al. 2021), whose methods the first table compares HyperPlanes with."""
 
 SOURCES = (PAPER, CODE, LEARNIT)

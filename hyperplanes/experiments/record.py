@@ -1,4 +1,4 @@
-"""What was made in a folder: work that survives an interruption, and is done again when what decides it has changed."""
+"""A record of the work done in a folder, which is repeated only if its settings have changed."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ __all__ = ["Record", "plain"]
 
 
 class Record:
-    """Settings, end and duration of every piece of work, kept in a JSON file.
+    """The settings, the completion and the duration of every piece of work, in a JSON file.
 
     Args:
-        path: of the file.
+        path: the file.
+
+    Raises:
+        CheckpointError: the file has invalid entries.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,17 +41,17 @@ class Record:
         return bool(known.get("done")) and known["settings"] == plain(settings) and all(p.exists() for p in outputs)
 
     def seconds(self, name: str) -> float:
-        """How long the work has taken, over all interruptions."""
+        """The seconds that the work has taken, over all interruptions."""
         return float(self._known.get(name, {}).get("seconds", 0.0))
 
     @contextmanager
     def working(self, name: str, settings: Mapping[str, Any], *outputs: Path) -> Generator[None]:
-        """The time in which something is worked on; an exception leaves it unfinished; the next call resumes it.
+        """A context for a piece of work. After an exception it is not done, and a later call resumes it.
 
         Args:
-            name: of the work.
-            settings: all that decides its result, JSON-able.
-            outputs: files and folders; removed first where they were made with other settings.
+            name: the name of the work.
+            settings: all settings on which the result depends, as values for JSON.
+            outputs: files and folders, which are removed first if they were made with other settings.
         """
         known = self._known.get(name)
         if known is None or known["settings"] != plain(settings):
@@ -68,7 +71,7 @@ class Record:
 
 
 def plain(settings: Mapping[str, Any]) -> Any:
-    """Settings as they come back from a JSON file."""
+    """Settings as a JSON file would return them, for comparison with those read from one."""
     return json.loads(json.dumps(settings))
 
 

@@ -1,4 +1,4 @@
-"""What an experiment has found beside what the paper says, as Markdown, CSV and JSON."""
+"""The results of an experiment beside the paper's numbers, as Markdown, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from hyperplanes.utilities.tables import csv_table, markdown_table
 __all__ = ["as_csv", "as_json", "as_markdown", "headings", "rows", "settings", "sources", "value", "what_differs"]
 
 SILENT = ("MultiPlaneNeRF", "PointMultiPlaneNeRF", "Autoencoder")
-"""Rows and columns of models of whose own settings the paper and its code say nothing."""
+"""Rows and columns of models whose settings the paper and its code do not state."""
 
 DECIMALS = {"psnr": 2, "psnr_pooled": 2, "ssim": 3, "image_seconds": 2}
 
 
 def value(score: Score, quantity: str) -> tuple[float, float | None]:
-    """A number of the table and its deviation: over seeds, where there are several; of seconds over objects."""
+    """A number of the table and its standard deviation: over seeds, if there are several; for seconds, over objects."""
     if quantity == "image_seconds":
         seconds = [each.image_seconds for each in score.objects]
         return fmean(seconds), pstdev(seconds)
@@ -34,7 +34,7 @@ def value(score: Score, quantity: str) -> tuple[float, float | None]:
 
 
 def headings(outcome: Outcome) -> list[str]:
-    """The heading of the rows, then of every column: ours, its pooled PSNR, and the paper's where it has one."""
+    """The headings of `rows`: for every column its result, its pooled PSNR if there is one, and the paper's number."""
     found = [""]
     for column in outcome.experiment.columns:
         found.append(column)
@@ -46,7 +46,7 @@ def headings(outcome: Outcome) -> list[str]:
 
 
 def rows(outcome: Outcome) -> list[list[str]]:
-    """The table as text."""
+    """The rows of the table as text."""
     experiment = outcome.experiment
     cells = {(cell.row, cell.column): cell for cell in experiment.cells}
     table = []
@@ -90,7 +90,7 @@ def _theirs(outcome: Outcome, row: str, column: str) -> str:
 
 
 def what_differs(outcome: Outcome) -> list[str]:
-    """What is not as in the paper, and what the paper leaves open, a line each."""
+    """Lines on the differences from the paper, and on what the paper does not state."""
     experiment, scale = outcome.experiment, outcome.scale
     lines = [f"Data: {_data(outcome)}. Paper: ShapeNet at {experiment.size}x{experiment.size}, 25 and 25 views."]
     if scale.steps is not None and (steps := _steps(outcome, scale.steps)):
@@ -104,18 +104,18 @@ def what_differs(outcome: Outcome) -> list[str]:
     if scale.evaluated is not None and experiment.objects is None:
         counts = sorted({len(score.objects) for score in outcome.scores.values()})
         count = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-        lines.append(f"Judged by {count} object{'' if count == '1' else 's'} a class. Paper: all test objects.")
+        lines.append(f"Evaluated on {count} object{'' if count == '1' else 's'} a class. Paper: all test objects.")
     lines.append(f"{_seeds(outcome)}. Paper: {experiment.runs or 'not stated'}.")
     silent = [
         name for name in SILENT if any(cell.column == name or cell.row.endswith(name) for cell in experiment.cells)
     ]
     if silent:
-        lines.append(f"Of {', '.join(silent)} no source states settings: those of the target of HyperPlanes are taken.")
+        lines.append(f"No source states settings of {', '.join(silent)}; those of the target of HyperPlanes are used.")
     return [*lines, *experiment.notes]
 
 
 def _data(outcome: Outcome) -> str:
-    """The data sets, and how many of their objects were trained on."""
+    """The data sets, and the number of training objects."""
     scale, parts = outcome.scale, []
     if len(outcome.given) < len(outcome.experiment.classes):
         size, views = f"{scale.resolution}x{scale.resolution}", scale.views // 2
@@ -128,7 +128,7 @@ def _data(outcome: Outcome) -> str:
 
 
 def _steps(outcome: Outcome, steps: int) -> str:
-    """How long each model was trained; nothing where all are packaged."""
+    """The number of steps of each training; empty if all models are packaged."""
     trained = [each.method in LEARNED for each in outcome.experiment.trainings if not each.packaged]
     learned = outcome.scale.learned.get("training.steps", steps)
     parts = [] if all(trained) else [f"{steps:,} steps of each model"]
@@ -138,7 +138,7 @@ def _steps(outcome: Outcome, steps: int) -> str:
 
 
 def _seeds(outcome: Outcome) -> str:
-    """What seeds there are, and what has none."""
+    """The number of seeds and their use."""
     packaged = [cell for cell in outcome.experiment.cells if cell.trained.packaged]
     if len(packaged) == len(outcome.experiment.cells):
         return "Seeds: packaged models are evaluated once"
@@ -148,27 +148,27 @@ def _seeds(outcome: Outcome) -> str:
 
 
 def _evaluated(score: Score) -> int:
-    """With how many seeds."""
+    """The number of seeds of a score."""
     return max(1, len(score.seeds))
 
 
 def settings(outcome: Outcome) -> list[list[str]]:
-    """The settings that a source states otherwise, a line each under `DIFFERENCE_HEADINGS`."""
+    """The settings for which a source states another value, one row each, under `DIFFERENCE_HEADINGS`."""
     return [each.row for each in differences(outcome.experiment, outcome.scale)]
 
 
 def sources() -> list[str]:
-    """Where the columns of `settings` come from, a line each."""
+    """The sources of the columns of `settings`, one line each."""
     return [f"{source.name}: {source.where}" for source in SOURCES]
 
 
 def as_markdown(outcome: Outcome, command: str, figures: Sequence[str] = ("figure.png",)) -> str:
-    """The table with all that one must know to read it.
+    """The page of an experiment: its table, figures, differences from the paper, command and machine.
 
     Args:
-        outcome: what was found.
-        command: what makes it again.
-        figures: the names of those that lie beside it.
+        outcome: the results.
+        command: the command that reproduces them.
+        figures: the names of the figures in the same folder.
     """
     experiment, where = outcome.experiment, environment()
     machine = f"{where['gpu'] or where['processor']}, {where['cores']} cores, torch {where['torch']}"
@@ -177,8 +177,8 @@ def as_markdown(outcome: Outcome, command: str, figures: Sequence[str] = ("figur
     columns, differing = "\n".join(f"- {line}" for line in sources()), ""
     if stated := settings(outcome):
         differing = (
-            f"Settings that a source states otherwise (preset {outcome.scale.presets[experiment.size]}); - where it "
-            f"states nothing:\n\n{markdown_table(DIFFERENCE_HEADINGS, stated)}\n{columns}\n\n"
+            f"Settings for which a source states another value (preset {outcome.scale.presets[experiment.size]}); - if "
+            f"it states none:\n\n{markdown_table(DIFFERENCE_HEADINGS, stated)}\n{columns}\n\n"
         )
     return (
         f"# {experiment.title}\n\nHyperPlanes (arXiv 2402.01524), {experiment.where}.\n\n"
@@ -190,7 +190,7 @@ def as_markdown(outcome: Outcome, command: str, figures: Sequence[str] = ("figur
 
 
 def as_csv(outcome: Outcome) -> str:
-    """A line a number, ours and the paper's, every digit."""
+    """One line per number, with the paper's number, in full precision."""
     lines: list[Sequence[object]] = []
     for cell in outcome.experiment.cells:
         score = outcome.scores[cell.row, cell.column]
@@ -202,7 +202,7 @@ def as_csv(outcome: Outcome) -> str:
 
 
 def as_json(outcome: Outcome, command: str) -> dict[str, Any]:
-    """All numbers, objects and seeds included."""
+    """All results, including those of single objects and seeds, as values for JSON."""
     found: dict[str, Any] = {}
     for cell in outcome.experiment.cells:
         score = outcome.scores[cell.row, cell.column]

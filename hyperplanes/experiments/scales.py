@@ -1,4 +1,4 @@
-"""How large an experiment is run: smoke, small, gpu or paper."""
+"""The scales at which an experiment is run: smoke, small, gpu and paper."""
 
 from __future__ import annotations
 
@@ -18,31 +18,32 @@ PAPER_VIEWS = 50
 
 @dataclass(frozen=True)
 class Scale:
-    """What is taken from the paper's setting and what is made smaller.
+    """The size of data, models and trainings of an experiment, compared with the paper's.
 
     Attributes:
-        name: of the scale.
-        presets: of the configuration, by the paper's pixels a side.
+        name: the name of the scale.
+        presets: the names of presets by the size of the paper's images, in pixels along a side.
         protocol: how rays are sampled, a name in `presets.PROTOCOLS`.
-        resolution: pixels a side of generated images; None where data must be given.
-        objects: generated a class, the held-out ones included.
-        held_out: of them.
-        views: an object, half support and half query. Numbers of planes and of HyperPlanes are in proportion to it.
-        steps: of every training; None for the paper's epochs, a step an object.
-        max_steps: the most gradient steps on the support views of an object.
-        max_curve_steps: the same where PSNR is drawn over their number.
-        evaluated: objects a class and split; None for all.
-        most_seeds: of a table; None for as many as the paper has.
-        changes: of the preset, by dotted names, before a method is chosen.
-        learned: likewise of learned initialisations, after the method is chosen.
-        learned_target: their field; "nerf" where None.
-        fine_tuning: rays, optimiser and rates of the gradient steps on an object.
-        scratch: the same of a field from random weights.
-        bounds: the sphere of every scene; what the files say or the masks show where None.
-        shown: numbers of support views, where a table has rows of several; None for all of them.
-        packaged: with the rows of models that come with the package.
-        data: what is generated otherwise, by class: entries that `generate` takes, and the `contents` of a folder that
-            it reads, as by `files.folder_checksum`.
+        resolution: pixels along a side of generated images; None if data sets must be given.
+        objects: generated objects per class, including the held-out ones.
+        held_out: held-out objects per class.
+        views: views per object, half support and half query views. Numbers of planes and of HyperPlanes are in
+            proportion to it.
+        steps: the steps of every training; None for the paper's epochs, each with one step per object.
+        max_steps: most gradient steps on the support views of an object.
+        max_curve_steps: most gradient steps in experiments that draw PSNR over the number of steps.
+        evaluated: evaluated objects per class and split; None for all.
+        most_seeds: the number of seeds of a table; None for as many as the paper has.
+        changes: changes of the preset by dotted names, made before a method is chosen.
+        learned: changes for learned initialisations, made after the method is chosen.
+        learned_target: the field of learned initialisations; None for "nerf".
+        fine_tuning: the settings of gradient steps on an object.
+        scratch: the settings of gradient steps of a field from random weights.
+        bounds: the sphere of every scene; None for that of the files or the masks.
+        shown: the numbers of support views of the rows that are kept; None for all of them.
+        packaged: whether to keep the rows of packaged models.
+        data: by class, changed options of `generate`, and as `contents` the checksum of a folder that it reads, by
+            `files.folder_checksum`.
     """
 
     name: str
@@ -68,11 +69,11 @@ class Scale:
     data: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
     def seeds(self, experiment: Experiment) -> int:
-        """How many seeds of an experiment are run: as the scale has, or as the paper, one where it does not say."""
+        """The number of seeds of an experiment: that of the scale, or that of the paper, which is 1 if not stated."""
         return (experiment.runs or 1) if self.most_seeds is None else self.most_seeds
 
     def applied(self, experiment: Experiment) -> Experiment:
-        """The experiment with the rows and the numbers of steps that the scale has."""
+        """The experiment with only those rows and numbers of steps that the scale allows."""
         kept = tuple(
             cell
             for cell in experiment.cells
@@ -90,11 +91,11 @@ class Scale:
         return replace(experiment, cells=tuple(cells.values()))
 
     def planes(self, count: int) -> int:
-        """A number of the paper's planes, in proportion to the views an object."""
+        """A number of planes of the paper, in proportion to the views per object."""
         return max(1, round(count * self.views / PAPER_VIEWS))
 
     def method(self, name: str) -> str:
-        """A method with at most as many steps as the scale allows.
+        """The name of a method with its number of steps limited to `max_steps`.
 
         >>> SCALES["smoke"].method("hyperplanes_100")
         'hyperplanes_2'
@@ -106,17 +107,19 @@ class Scale:
 
 
 PUBLISHED_BOUNDS = Sphere((0.0, 0.0, 0.0), 2.0)
-"""Near 2 and far 6 of cameras at a distance of 4, as learnit and the authors have them (`published.LEARNIT`)."""
+"""Near 2 and far 6 for cameras at a distance of 4, as in learnit and in the authors' code (`published.LEARNIT`)."""
 
 AUTHORS_FINE_TUNING = FineTuning(
     "hypernetwork", 512, "adam", learning_rate=1e-4, final_rate_factor=1.0, betas=(0.9, 0.999), mask_views=False
 )
-"""The hypernetwork with the target frozen, as the paper says, by the steps of the authors' code (`published.CODE`)."""
+"""The hypernetwork is optimised while the target is frozen, as the paper states, with the optimiser and the rates of
+the authors' code (`published.CODE`)."""
 
 NERF_TRAINING = FineTuning(
     "weights", 4096, "adam", learning_rate=5e-4, final_rate_factor=0.1, decay="exponential", betas=(0.9, 0.999)
 )
-"""NeRF's own (Mildenhall et al. 2020, section 5.3): 4,096 rays, Adam at 5e-4 that falls exponentially to 5e-5."""
+"""The training of NeRF (Mildenhall et al. 2020, section 5.3): 4,096 rays, Adam with rates from 5e-4 to 5e-5 by
+exponential decay."""
 
 LEARNIT = {
     "model.network.depth": 5,
@@ -125,7 +128,7 @@ LEARNIT = {
     "model.sampling": Hierarchical(128, 0),
     "training.steps": 100_000,
 }
-"""One network of five hidden layers and an output layer, 128 samples, 100,000 iterations (`published.LEARNIT`)."""
+"""One network with five hidden layers and an output layer, 128 samples, 100,000 iterations (`published.LEARNIT`)."""
 
 SCALES: dict[str, Scale] = {
     each.name: each
@@ -221,4 +224,4 @@ SCALES: dict[str, Scale] = {
         ),
     )
 }
-"""By the names that `hyperplanes reproduce --scale` takes."""
+"""The scales by the names that `hyperplanes reproduce --scale` takes."""

@@ -1,4 +1,4 @@
-"""The ten experiments of the paper as data: what is trained, what is evaluated, and where it stands in the paper."""
+"""The ten experiments of the paper as data: their trainings, their evaluations, and their places in the paper."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hyperplanes.utilities.errors import did_you_mean
 __all__ = ["CLASSES", "EXPERIMENTS", "find_experiment", "find_experiments"]
 
 CLASSES = {"Cars": "car", "Chairs": "chair", "Planes": "plane", "Lamps": "lamp"}
-"""The paper's headings and the names of the classes of `generate`."""
+"""The names of the classes of `generate` by the paper's headings."""
 
 EPOCHS_128 = {"car": 1000, "lamp": 1100, "chair": 700}
 EPOCHS_200 = {"car": 2420, "plane": 2460, "chair": 1920}
@@ -24,17 +24,17 @@ LEARNED = {
     "MV Meta": ("mv_meta", "mv_meta"),
     "SV Meta": ("sv_meta", "sv_meta"),
 }
-"""Methods of Tancik et al. and the training that each needs; of "standard" only the shape is read."""
+"""Methods of Tancik et al., each with the training that it needs. "standard" only needs its architecture."""
 SHOWN = (1, 3, 5, 25)
-"""Support views of the table of learned initialisations: the paper does not say how many those were given."""
+"""Numbers of support views in the table of learned initialisations; the paper does not state how many these had."""
 TARGETS = {"NeRF": "nerf", "MultiPlaneNeRF": "multiplane", "PointMultiPlaneNeRF": "point_multiplane"}
 TUNED = {"HyperPlanes-0": "hyperplanes", "HyperPlanes-10": "hyperplanes_10", "HyperPlanes-100": "hyperplanes_100"}
 WHOLE = "HyperPlanes-100, all weights"
-"""100 steps on theta + delta as `render --steps 100` takes them, at `small` with fewer rays; not in the paper."""
+"""100 steps on theta + delta as in `render --steps 100`, with fewer rays at the scale `small`; not in the paper."""
 
 
 ALL_READ: Mapping[str, object] = {"model.hypernetwork.views": 25}
-"""25 HyperPlanes, as the paper has them at 200x200 (tab:cross)."""
+"""25 HyperPlanes, as in the paper at 200x200 (tab:cross)."""
 
 
 def _hyperplanes(on: str, changes: Mapping[str, object] | None = None, planes: int = ALL_PLANES) -> Trained:
@@ -73,7 +73,7 @@ def _shapenet() -> Experiment:
         (
             "The paper gives HyperPlanes 25 support views and does not say how many the methods of Tancik et al. were "
             "given for their 2,000 steps. Their published notebook (tancik/learnit, Experiments/shapenet.ipynb, "
-            "test_time_views = 1) judges every training by one, so the paper's numbers stand beside 1 view, as a "
+            "test_time_views = 1) evaluates every training with one, so the paper's numbers are beside 1 view, as a "
             "guess.",
             "small: the packaged model of any number of views, trained by this project on four procedural classes at "
             "128x128; not in the paper.",
@@ -93,7 +93,7 @@ def _cross_class() -> Experiment:
         on = _hyperplanes(CLASSES[source], ALL_READ)
         for target in names:
             row = f"{source} on {target}"
-            for column in ("MultiPlaneNeRF", "PointMultiPlaneNeRF"):  # the latter: the field of HyperPlanes alone
+            for column in ("MultiPlaneNeRF", "PointMultiPlaneNeRF"):  # the latter is the field of HyperPlanes alone
                 plain = Trained(CLASSES[source], TARGETS[column])
                 cells.append(Cell(row, column, plain, TARGETS[column], CLASSES[target]))
             cells += _tuned(row, on, CLASSES[target])
@@ -111,7 +111,7 @@ def _cross_class() -> Experiment:
             "The paper's MultiPlaneNeRF has 24.91 dB for cars and 24.27 for planes here, and 24.79 and 24.26 in "
             "tab:single_inference.",
             "PointMultiPlaneNeRF: the field of HyperPlanes as one set of weights for all objects, not in the paper. "
-            "MultiPlaneNeRF and HyperPlanes differ in the field and in the hypernetwork; this column tells them apart.",
+            "MultiPlaneNeRF and HyperPlanes differ in the field and in the hypernetwork; this column separates both.",
             f"{WHOLE}: not in the paper.",
         ),
     )
@@ -208,7 +208,7 @@ def _iterations() -> Experiment:
         (
             "The paper has a picture and says: NeRF needs approximately 36000 epochs (63.7 minutes) to reach what one "
             "step of HyperPlanes does in 10 seconds, a speedup of 380, on two objects.",
-            "NeRF is optimised on the same support views and judged on the same query views as HyperPlanes.",
+            "NeRF is optimised on the same support views and evaluated on the same query views as HyperPlanes.",
         ),
         1,
     )
@@ -254,7 +254,7 @@ def _number_of_imageplanes() -> Experiment:
         (
             "The paper has a picture and says that 25 are best. One caption says ShapeNet 128x128, the other 200x200.",
             "Above 25 the planes are the support views and the first query views, as support and query are one set in "
-            "the paper: some views that a row is judged by are then among its planes.",
+            "the paper: some of the evaluated views are then among the planes.",
         ),
     )
 
@@ -326,19 +326,19 @@ EXPERIMENTS: dict[str, Experiment] = {
         _layers(),
     )
 }
-"""By the names that `hyperplanes reproduce` takes."""
+"""The experiments by the names that `hyperplanes reproduce` takes."""
 
 
 def find_experiments() -> dict[str, Experiment]:
-    """The tables of the paper, then those that entry points of the group `hyperplanes.tables` name."""
+    """The tables of the paper, then those of other packages (entry points of the group `hyperplanes.tables`)."""
     return EXPERIMENTS | load_entries("hyperplanes.tables", EXPERIMENTS)
 
 
 def find_experiment(name: str) -> Experiment:
-    """One table.
+    """One table or figure.
 
     Args:
-        name: of `find_experiments`.
+        name: a name in `find_experiments()`.
 
     Raises:
         ValueError: an unknown name.

@@ -1,4 +1,4 @@
-"""Trains what experiments ask for: each training once, kept in a workspace."""
+"""The trainings of experiments, each run once and kept in a workspace."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from hyperplanes.views import Tasks
 __all__ = ["Train", "Trainings"]
 
 Train = Callable[[Trained, Preset, Tasks, Path | None, Path], None]
-"""Called with what is trained, its configuration, the data, the folder of the training it reads, if any, and the folder
-of the checkpoint; goes on where it was interrupted."""
+"""A function that runs or resumes a training. Its arguments are the training, its configuration, the data, the folder
+of the training that it reads, if any, and the folder of the checkpoint."""
 
 
 class Trainings:
-    """The trainings of experiments, each made once with the same settings.
+    """The trainings of experiments, each run once for the same settings.
 
-    They lie in a workspace under names that hold a checksum of all that decides them: experiments that need the same
-    training share it, and after an interruption the same call goes on.
+    They are folders in a workspace, whose names contain a checksum of all settings on which they depend. So experiments
+    that need the same training share it. To resume after an interruption, make the same call again.
 
     Args:
-        workspace: the folder for everything.
-        data: the data sets, and how large everything is.
-        train: makes one.
-        workers: processes in which they run side by side; this one where absent.
+        workspace: the folder for all results.
+        data: the data sets; they also have the scale.
+        train: runs a training.
+        workers: processes that run trainings side by side; with None, this process runs them.
     """
 
     def __init__(self, workspace: Workspace, data: DataSets, train: Train, workers: Workers | None) -> None:
         self.workspace, self.data, self.train, self.workers = workspace, data, train, workers
 
     def configuration(self, experiment: Experiment, trained: Trained, seed: int) -> Preset:
-        """Model and training, as configured for the objects that there are."""
+        """The configuration of a training for the number of objects in the data set."""
         objects = len(self.data.tasks(trained.on).names("train"))
         return configuration(experiment, trained, self.data.scale, objects, seed)
 
     def arranged(self, trained: Trained, chosen: Preset) -> Tasks:
-        """The data of a training, with as many support views as its model has planes."""
+        """The data of a training, with as many support views per object as its model has planes."""
         return WithSupport(self.data.tasks(trained.on), chosen.model.network.planes)
 
     def folder(self, experiment: Experiment, trained: Trained, seed: int) -> Path:
-        """The checkpoint of a training, which is made where it is not there, or of a packaged model."""
+        """The checkpoint of a training, which is run if necessary, or of a packaged model."""
         if trained.packaged:
             return packaged_folder(trained.packaged)
         reference = trained.reference and self.folder(experiment, trained.reference, seed)
@@ -62,18 +62,18 @@ class Trainings:
         return self.workspace.folder(*self._place(experiment, trained, seed), work)
 
     def is_made(self, experiment: Experiment, trained: Trained, seed: int) -> bool:
-        """Whether `folder` would make nothing."""
+        """Whether the training is done already."""
         return bool(trained.packaged) or self.workspace.has_folder(*self._place(experiment, trained, seed))
 
     def make_all(self, experiment: Experiment, seed: int, on_free: Callable[[], object] = lambda: None) -> None:
-        """The trainings of an experiment, side by side where there are workers; those that read others come later.
+        """Run the trainings of an experiment, side by side if there are workers; those that read others come last.
 
-        Each is recorded, with its own duration, when it ends.
+        Each is recorded with its own duration when it ends.
 
         Args:
-            experiment: which.
-            seed: of the trainings.
-            on_free: called whenever workers have nothing left to begin with, as long as one still trains.
+            experiment: the experiment.
+            seed: the seed of the trainings.
+            on_free: called when all trainings have begun, and whenever one of them ends while others still run.
         """
         if self.workers is not None:
             self._make_side_by_side(self.workers, experiment, seed, on_free)
@@ -83,7 +83,7 @@ class Trainings:
     def _make_side_by_side(
         self, workers: Workers, experiment: Experiment, seed: int, on_free: Callable[[], object]
     ) -> None:
-        """The trainings that read no other one."""
+        """Run the trainings that read no other training."""
         running: dict[Future[None], ExitStack] = {}
 
         def finish_next() -> None:
@@ -96,7 +96,7 @@ class Trainings:
             for trained in experiment.trainings:
                 if trained.packaged or trained.reference:
                     continue
-                if len(running) == workers.count:  # one that waits takes no time
+                if len(running) == workers.count:  # a training that waits for a worker must not be timed
                     finish_next()
                 recorded = unfinished.enter_context(ExitStack())
                 making = self.workspace.making_folder(*self._place(experiment, trained, seed))
@@ -109,7 +109,7 @@ class Trainings:
                 finish_next()
 
     def name(self, experiment: Experiment, trained: Trained, seed: int) -> str:
-        """What tells a training from others: the name of a packaged model, or one with a checksum."""
+        """A unique name of a training, with a checksum, or the name of a packaged model."""
         if trained.packaged:
             return trained.packaged
         return self._named(trained, seed, self._settings(experiment, trained, seed))
@@ -118,12 +118,12 @@ class Trainings:
         return unique_name(f"{Path(self.data.name(trained.on)).name}-{trained.method}-{seed}", settings)
 
     def _place(self, experiment: Experiment, trained: Trained, seed: int) -> tuple[str, str, str, dict[str, Any]]:
-        """What `Workspace.folder` tells the folder of a training by."""
+        """The arguments of `Workspace.folder` that identify the folder of a training."""
         settings = self._settings(experiment, trained, seed)
         return "trainings", trained.method, self._named(trained, seed, settings), settings
 
     def _settings(self, experiment: Experiment, trained: Trained, seed: int) -> dict[str, Any]:
-        """All that decides a training."""
+        """All settings on which a training depends."""
         chosen, reference = self.configuration(experiment, trained, seed), trained.reference
         return {
             "data": list(self.data.tasks(trained.on).names("train")),

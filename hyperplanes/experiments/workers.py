@@ -1,8 +1,8 @@
-"""Processes of one thread each, in which trainings run side by side and objects are evaluated.
+"""Processes with one thread each, which run trainings side by side and evaluate objects.
 
-The networks of an experiment are so small that two threads take one training hardly further than one does. Two
-processes on two cores make 1.95 times the steps of one: a step of the demonstration's HyperPlanes takes 308 ms beside
-PointMultiPlaneNeRF and 306 alone, one of the latter 204 and 194.
+The networks of an experiment are so small that two threads are hardly faster than one. Two processes on two cores take
+1.95 times as many steps as one process: in the demonstration, a step of HyperPlanes takes 308 ms while
+PointMultiPlaneNeRF is trained as well and 306 ms alone, and a step of PointMultiPlaneNeRF 204 ms and 194 ms.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ __all__ = ["Result", "Workers"]
 
 
 class HasData(Protocol):
-    """What a process does its work with: `experiments.engine.Runner`."""
+    """The object with which a process does its work: `experiments.engine.Runner`."""
 
     data: DataSets
 
 
 Result = TypeVar("Result")
-"""What a piece of work returns."""
+"""The result of a piece of work."""
 
 PATIENCE = 2.0
-"""Seconds in which workers end that were sent the signal as well, as by `timeout`: a second one would end a training
-before its checkpoint is written."""
+"""Seconds to wait for workers before SIGTERM is sent to them. They may have received a signal as well, for example from
+`timeout`, and a second one would end a training before its checkpoint is written."""
 
 SAVING = 10.0
-"""Seconds that they have for it."""
+"""Seconds that workers have to write checkpoints after SIGTERM."""
 
 
 class Workers:
-    """A pool of processes, which end with the context; what they were doing ends as after SIGTERM.
+    """A pool of processes, as a context. After an exception in the context, they are ended with SIGTERM.
 
     Args:
-        count: of processes.
-        make: makes what a process does its work with; pickled.
+        count: the number of processes.
+        make: makes the object with which a process does its work; it is pickled.
 
     Raises:
-        ChildProcessError: at the end of the context, where a process was killed within it.
+        ChildProcessError: at the end of the context, if a process was killed.
     """
 
     def __init__(self, count: int, make: Callable[[], HasData]) -> None:
@@ -70,27 +70,29 @@ class Workers:
             for child in children:
                 child.join(max(0.0, until - time.monotonic()))
             for child in children:
-                child.terminate()  # of those that have ended, nothing
+                child.terminate()  # does nothing to a process that has ended
             until = time.monotonic() + SAVING
-            for child in children:  # one that ended with the lock of the pool's queue leaves others waiting for it
+            for (
+                child
+            ) in children:  # a process may wait forever for the lock of the pool's queue if another died with it
                 child.join(max(0.0, until - time.monotonic()))
                 child.kill()
         self._pool.shutdown()
         if isinstance(error, BrokenExecutor):
             raise ChildProcessError(
                 f"workers: expected {self.count} processes to the end, found that one was killed or ended by itself, "
-                "perhaps for want of memory; give fewer --workers, and the same command goes on"
+                "perhaps for lack of memory; run the same command again with fewer --workers to resume"
             ) from error
 
     def submit(self, folders: Mapping[str, Path], work: Callable[[Any], Result]) -> Future[Result]:
-        """Do a piece of work in a process, as soon as one is free.
+        """Do a piece of work in a process as soon as one is free.
 
         Args:
-            folders: of the data sets by class; a worker generates none.
-            work: called with what `make` made in the process; pickled, as its result is.
+            folders: the folders of the data sets by class, because a worker generates none.
+            work: called with the object that `make` made in the process. The function and its result are pickled.
         """
         pool = self._started()
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # of processes that this starts, too
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # new processes inherit the mask
         try:
             return pool.submit(_do, folders, work)
         finally:
@@ -103,18 +105,18 @@ class Workers:
         return self._pool
 
 
-_runner: HasData  # of a worker process
+_runner: HasData  # the object made by `make`, in a worker process
 
 
 def _start(make: Callable[[], HasData]) -> None:
     global _runner
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which ends its workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, and the parent ends its workers
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     torch.set_num_threads(1)
     _runner = make()
 
 
 def _do(folders: Mapping[str, Path], work: Callable[[Any], Result]) -> Result:
-    _runner.data.generated |= folders  # given ones, which the process knows, go first
+    _runner.data.generated |= folders  # given data sets, which the process knows, have precedence
     with interruptible():
         return work(_runner)

@@ -1,4 +1,4 @@
-"""The folder of an experiment: data sets, trainings and pages, each made once with the same settings."""
+"""The folder of an experiment with data sets, trainings and pages, each made once for the same settings."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["Workspace", "unique_name"]
 
 
 class Workspace:
-    """A folder in which what is not made yet is made, and what was interrupted goes on.
+    """A folder in which work is done if it was not done before with the same settings; interrupted work is resumed.
 
     Args:
         out: the folder.
-        places: folders by class and by method, for an experiment that has the workspace for itself: results lie under
-            these names, scores/ and pictures/, and those that were made with other settings are removed. Without it
-            they lie in data/, trainings/ and evaluations/, which all experiments share.
-        begin: called before anything is made.
+        places: the names of folders by class and by method, for a workspace with a single experiment. Results are in
+            these folders, scores/ and pictures/, and those with other settings are removed. With None, results are in
+            data/, trainings/ and evaluations/, which all experiments share.
+        begin: called before each piece of work.
     """
 
     def __init__(
@@ -39,10 +39,10 @@ class Workspace:
 
     @contextmanager
     def making(self, name: str, settings: Mapping[str, Any], outputs: Sequence[Path]) -> Generator[bool]:
-        """The time in which a piece of work is done, as by `make`; several may overlap.
+        """A context in which a piece of work is done, as in `make`; several contexts may overlap.
 
         Yields:
-            Whether it is to be done: it was not yet.
+            Whether the work has to be done.
         """
         if self.record.done(name, settings, *outputs):
             yield False
@@ -54,14 +54,14 @@ class Workspace:
     def folder(
         self, kind: str, place: str, name: str, settings: Mapping[str, Any], work: Callable[[Path], None]
     ) -> Path:
-        """The folder of a data set or of a training, which is made there unless it was.
+        """The folder of a data set or of a training, whose content is made if it was not made before.
 
         Args:
-            kind: data or trainings.
-            place: the class or the method, whose folder `places` gives.
-            name: what tells it from others of its kind, as by `unique_name`.
-            settings: all that decides its content.
-            work: called with the folder.
+            kind: "data" or "trainings".
+            place: the class or the method, the key in `places`.
+            name: a unique name, as by `unique_name`.
+            settings: all settings on which the content depends.
+            work: makes the content; called with the folder.
         """
         with self.making_folder(kind, place, name, settings) as (folder, needed):
             if needed:
@@ -72,7 +72,7 @@ class Workspace:
     def making_folder(
         self, kind: str, place: str, name: str, settings: Mapping[str, Any]
     ) -> Generator[tuple[Path, bool]]:
-        """The time in which the folder of a data set or of a training is made, as by `folder`; several may overlap.
+        """A context in which the content of a folder is made, as in `folder`; several contexts may overlap.
 
         Args:
             kind: as in `folder`.
@@ -81,22 +81,22 @@ class Workspace:
             settings: as in `folder`.
 
         Yields:
-            The folder, and whether it is to be made: it was not yet.
+            The folder, and whether its content has to be made.
         """
         path = self.path(kind, place, name)
         with self.making(path, {"name": name, **settings}, [self.out / path]) as needed:
             yield self.out / path, needed
 
     def has_folder(self, kind: str, place: str, name: str, settings: Mapping[str, Any]) -> bool:
-        """Whether `folder` would make nothing."""
+        """Whether the content of a folder was made already."""
         path = self.path(kind, place, name)
         return self.record.done(path, {"name": name, **settings}, self.out / path)
 
     def path(self, kind: str, place: str, name: str) -> str:
-        """Where `folder` is, seen from the workspace; also what its work is recorded as."""
+        """The path of a folder relative to the workspace, which is also the name of its work in the record."""
         return f"{kind}/{name}" if self.places is None else self.places[place]
 
 
 def unique_name(start: str, settings: Mapping[str, Any]) -> str:
-    """A readable name with a checksum of what decides the content."""
+    """A name with a checksum of the settings, from a readable start."""
     return f"{start}-{hashlib.sha256(encode_json(plain(settings))).hexdigest()[:10]}"

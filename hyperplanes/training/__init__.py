@@ -1,4 +1,4 @@
-"""Meta-training: the hypernetwork and theta, or an initialisation alone, from tasks (HyperPlanes, Algorithm 1)."""
+"""Meta-training of the hypernetwork and theta, or of an initialisation alone, on tasks (HyperPlanes, Algorithm 1)."""
 
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.monitoring import Progress

@@ -1,11 +1,11 @@
-"""The checkpoints of a training: one consistent state on disk at any moment, whenever the power goes.
+"""The checkpoints of a training. The files are a consistent state at any moment, even after a power failure.
 
 training.json                   step, curve, configuration, and the name of the file of that step; written last
-training-00000500.safetensors   weights and optimisers of step 500
-training-00000500.json          what training.json was at step 500, where earlier steps are kept: copied over
-                                training.json, the training goes on from there
-model.json, model.safetensors   the model alone, for everybody else
-best/                           the model with the highest PSNR of held-out objects
+training-00000500.safetensors   weights and optimiser states of step 500
+training-00000500.json          training.json of step 500, if earlier steps are kept; to resume from that step, copy
+                                it over training.json
+model.json, model.safetensors   the model alone, for everything but training
+best/                           the model with the highest PSNR on held-out objects
 """
 
 from __future__ import annotations
@@ -41,11 +41,13 @@ STATE = re.compile(r"training-(\d{8,})\.safetensors")
 REMEDY = "give another --out folder or the same options"
 
 MAY_DIFFER = ("steps", "epochs", "evaluate_every", "held_out", "checkpoint_every", "keep_last", "memory", "prefetch")
-"""Settings that may be others in a training that is resumed."""
+"""Settings that may change when a training is resumed."""
 
 
 def choose_precision(config: TrainingConfig, model: HyperPlanes, folder: Path | None) -> str:
-    """What `config.precision` "automatic" is: what the training in the folder began with, or what is fast and exact.
+    """The precision of a training. "automatic" is the one that the training in the folder began with, if there is one.
+
+    Otherwise "automatic" is bfloat16 if the hypernetwork reads volumes and the CPU computes fast in bfloat16.
 
     Returns:
         "single" or "bfloat16".
@@ -55,7 +57,7 @@ def choose_precision(config: TrainingConfig, model: HyperPlanes, folder: Path | 
     if folder is not None and (folder / "training.json").exists():
         before = read_json(folder / "training.json").get("config")
         found = before.get("precision") if isinstance(before, dict) else None
-        if found in ("single", "bfloat16"):  # others are refused where the state is read
+        if found in ("single", "bfloat16"):  # other values are refused when the state is read
             return found
     suits = model.reads_volume and model.rig.device.type == "cpu" and has_fast_bfloat16()
     return "bfloat16" if suits else "single"
@@ -65,14 +67,14 @@ class Checkpointing:
     """Reads and writes the state of one training.
 
     Args:
-        folder: of the training; without one, nothing is read or written.
-        model: that is trained.
+        folder: the folder of the training; with None, nothing is read or written.
+        model: the model that is trained.
         optimisation: its optimisers.
-        config: of the training.
-        writes: whether this process is the one that writes.
+        config: the configuration of the training.
+        writes: whether this process writes the files.
 
     Raises:
-        CheckpointError: the folder holds another model, or weights without the state of their training.
+        CheckpointError: the folder has another model, or weights without the state of their training.
     """
 
     def __init__(
@@ -86,17 +88,17 @@ class Checkpointing:
 
     @property
     def resumable(self) -> bool:
-        """Whether there is a state to go on from."""
+        """Whether the folder has a state to resume from."""
         return self.folder is not None and (self.folder / "training.json").exists()
 
     def resume(self, loader: EpisodeLoader) -> tuple[int, Curve]:
         """Set weights and optimisers to the last state, if there is one.
 
         Args:
-            loader: of the objects, which are to be those that the training began with.
+            loader: the loader of the objects, which must be those that the training began with.
 
         Returns:
-            The steps done, and the curve. DataError where the state is that of another training, or damaged.
+            The steps done, and the curve. DataError if the state is damaged or belongs to another training.
         """
         if self.folder is None or not self.resumable:
             return 0, []
@@ -106,11 +108,11 @@ class Checkpointing:
             self._check(path, saved, loader.fingerprint)
             self._load(self.folder / saved["state"])
         if self._writes and not (self.folder / "model.safetensors").exists():
-            self.model.save(self.folder)  # of a first checkpoint that was killed before it
+            self.model.save(self.folder)  # the process was killed while it wrote the first checkpoint
         return saved["step"], saved["curve"]
 
     def _check(self, path: Path, saved: Mapping[str, Any], data: Mapping[str, Any]) -> None:
-        """Refuse what is in training.json where it is of another training, on other data, or none."""
+        """Refuse the content of training.json if it is invalid, or of another training or other data."""
         for name, kind in ENTRIES.items():
             if not isinstance(saved.get(name), kind):
                 found = "none" if name not in saved else type(saved[name]).__name__
@@ -132,7 +134,7 @@ class Checkpointing:
             raise CheckpointError(f"{path}: expected the name of a file of states, found {saved['state']!r}; {REMEDY}")
 
     def _load(self, path: Path) -> None:
-        """Set weights and moments to those of a file."""
+        """Set the weights and the states of the optimisers to those in a file."""
         found = load_tensors(path)
         weights = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         moments: dict[str, Tensor] = {}
@@ -153,7 +155,7 @@ class Checkpointing:
             optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
 
     def save(self, step: int, curve: Curve, diagnostics: Diagnostics | None, loader: EpisodeLoader) -> None:
-        """Write model and state, whole or not at all."""
+        """Write the model and the state of the training; an interruption leaves the previous state valid."""
         if not self._writes or self.folder is None:
             return
         if diagnostics is not None:
@@ -174,19 +176,19 @@ class Checkpointing:
         if (self.folder / "training.json").exists():
             self.model.save(self.folder)
             write_json(self.folder / "training.json", document)
-        else:  # a model without training.json beside it is one that lost it, see `check_whole`
+        else:  # the model comes second, because `check_whole` refuses a model without training.json
             write_json(self.folder / "training.json", document)
             self.model.save(self.folder)
         _delete_old(self.folder, name, self.config.keep_last)
 
     def save_best(self) -> None:
-        """Write the model as the one with the highest PSNR so far."""
+        """Write the model to best/."""
         if self._writes and self.folder is not None:
             self.model.save(self.folder / "best")
 
 
 def _delete_old(folder: Path, newest: str, kept: int) -> None:
-    """Delete all states but the newest and those of the last steps before it; later ones are of an abandoned run."""
+    """Delete all states but the newest and the `kept` - 1 before it; later steps belong to an abandoned training."""
     states = sorted(path.name for path in folder.glob("training-*.safetensors") if STATE.fullmatch(path.name))
     earlier = [name for name in states if _step(name) < _step(newest)]
     staying = {newest, *earlier[len(earlier) - min(kept - 1, len(earlier)) :]}
@@ -215,7 +217,7 @@ def _compare_data(path: Path, before: Mapping[str, Any], now: Mapping[str, Any])
 
 
 def _is_report(row: object) -> bool:
-    """Whether it can be a row of a curve; None stands for what was not measured."""
+    """Whether a value is a row of a curve: numbers by name, among them the step. None means not measured."""
     if not isinstance(row, dict) or not isinstance(row.get("step"), int | float):
         return False
     return all(value is None or isinstance(value, int | float) for value in row.values())
@@ -225,11 +227,11 @@ def check_whole(folder: Path) -> None:
     """Refuse a folder in which a new training would replace weights.
 
     Raises:
-        CheckpointError: weights are there, but not training.json, which says how they were trained.
+        CheckpointError: the folder has weights, but not training.json, the state of their training.
     """
     if not (folder / "training.json").exists() and (folder / "model.safetensors").exists():
         kept = sorted(path.name for path in folder.glob("training-*.json"))
-        remedy = f"copy {kept[-1]} over it to go on from there" if kept else "give another --out folder"
+        remedy = f"copy {kept[-1]} to it to resume from there" if kept else "give another --out folder"
         raise CheckpointError(
             f"{folder / 'training.json'}: expected the state of the training beside its weights, found none, and a new "
             f"training would replace them; {remedy}, or --out elsewhere with --checkpoint {folder} to begin with them"
@@ -237,10 +239,10 @@ def check_whole(folder: Path) -> None:
 
 
 def check_model(folder: Path, config: ModelConfig) -> None:
-    """Refuse a folder that holds another model.
+    """Refuse a folder that has another model.
 
     Raises:
-        CheckpointError: it holds another one; the message says in what.
+        CheckpointError: the folder has another model; the message names the settings that differ.
     """
     path = folder / "model.json"
     if path.exists() and (differing := ModelConfig.load(folder).differences(config)):

@@ -1,13 +1,15 @@
-"""Processes that share the objects of every step, by torch.distributed: gradients averaged, stops and errors agreed on.
+"""Processes that share the objects of every step, by torch.distributed: they average gradients and stop together.
 
-Lightning Fabric starts the processes and joins them (`launching.py`). Its collectives (2.6.6) do not serve:
-`all_reduce` sends a barrier and a message for every tensor, 284 ms for the 79 gradients of `small` in two processes of
-one machine where one message takes 13 ms; `broadcast` pickles what it sends; `setup` averages gradients in the backward
-pass of a wrapped module, and those of Reptile and MAML are made by no backward pass, while the losses of one step go
-through several fields of the same weights. What is used here are the functions of torch.distributed that they call.
+Lightning Fabric starts the processes and joins them to a group (`launching.py`). Its collectives (2.6.6) are not used:
+- `all_reduce` sends a barrier and a message for every tensor. For the 79 gradients of `small` in two processes of one
+  machine this takes 284 ms, while one message takes 13 ms.
+- `broadcast` pickles its argument.
+- `setup` averages gradients in the backward pass of a wrapped module. The gradients of Reptile and MAML are not made by
+  a backward pass, and the losses of one step depend on several fields of the same weights.
+The functions of torch.distributed, which Fabric calls, are used instead.
 
-Each process renders its share of a step's objects. Weights, optimisers and draws are the same in all of them, so each
-could go on alone from any checkpoint. The first one writes files and validates on held-out objects.
+Each process renders its share of a step's objects. Weights, optimisers and random draws are the same in all processes,
+so a single one can resume from any checkpoint. The first process writes files and validates on held-out objects.
 """
 
 from __future__ import annotations
@@ -27,35 +29,35 @@ Value = TypeVar("Value")
 
 
 class ProcessEnded(ValueError):
-    """Another process of the training ended, which says why itself."""
+    """Another process of the training has ended; that process prints the reason."""
 
 
 @contextmanager
 def other_processes() -> Generator[None]:
-    """Turns what torch.distributed raises when another process has gone into `ProcessEnded`.
+    """A context that turns the errors of torch.distributed after the end of another process into `ProcessEnded`.
 
     Raises:
-        ProcessEnded: another process has gone.
-        RuntimeError: any other that was raised within.
+        ProcessEnded: another process has ended.
+        RuntimeError: any other RuntimeError that is raised in the context.
     """
     try:
         yield
     except RuntimeError as error:
         if not isinstance(error, distributed.DistError) and "gloo" not in str(error):
             raise
-        raise ProcessEnded("another process of this training has ended; its own message says why") from error
+        raise ProcessEnded("another process of this training has ended; see the message of that process") from error
 
 
 def check_shares(tasks: int, reference_objects: int, processes: int) -> None:
     """Refuse numbers of objects that the processes cannot share evenly.
 
     Args:
-        tasks: objects a step that are rendered.
-        reference_objects: objects a step of which only the HyperPlanes are read.
-        processes: that share them.
+        tasks: objects per step that are rendered.
+        reference_objects: objects per step of which only the HyperPlanes are read.
+        processes: the number of processes that share them.
 
     Raises:
-        ValueError: a number that cannot be divided.
+        ValueError: a number of objects that is not a multiple of the number of processes.
     """
     for name, count in (("tasks", tasks), ("reference_objects", reference_objects)):
         if count % processes:
@@ -71,8 +73,8 @@ class Processes:
     """The processes of this training.
 
     Attributes:
-        rank: which one this is, from 0.
-        count: how many there are.
+        rank: the index of this process, from 0.
+        count: the number of processes.
     """
 
     rank: int = 0
@@ -80,24 +82,24 @@ class Processes:
 
     @classmethod
     def current(cls) -> Processes:
-        """Those of torch.distributed's default group; a single one where there is none."""
+        """The processes of torch.distributed's default group; a single one if there is no group."""
         if not (distributed.is_available() and distributed.is_initialized()):
             return cls()
         return cls(distributed.get_rank(), distributed.get_world_size())
 
     @property
     def first(self) -> bool:
-        """Whether this is the one that writes and reports."""
+        """Whether this process writes files and reports."""
         return self.rank == 0
 
     def share(self, values: Sequence[Value]) -> Sequence[Value]:
-        """The part of some values that is this process's: as long as everyone else's, one after the other.
+        """The part of some values for this process. Parts are consecutive and equally long.
 
         >>> Processes(1, 2).share("abcdef")
         'def'
 
         Args:
-            values: a multiple of the number of processes.
+            values: a sequence whose length is a multiple of the number of processes.
         """
         size = len(values) // self.count
         return values[self.rank * size : (self.rank + 1) * size]
@@ -111,15 +113,16 @@ class Processes:
         return total / self.count
 
     def average(self, parameters: Iterable[Tensor], loss: float, stopping: bool) -> tuple[float, bool]:
-        """Put the mean of the gradients of all processes in the place of each, in one exchange.
+        """Replace the gradients by their means over all processes, in one exchange.
 
         Args:
-            parameters: the same in every process; one that no process has a gradient of is left without.
-            loss: of this process.
-            stopping: whether it is asked to stop.
+            parameters: the parameters, the same in every process. If no process has a gradient of a parameter, it gets
+                none.
+            loss: the loss of this process.
+            stopping: whether this process was requested to stop.
 
         Returns:
-            The mean loss, and whether any process is asked to stop.
+            The mean loss, and whether any process was requested to stop.
         """
         if self.count == 1:
             return loss, stopping
@@ -136,14 +139,14 @@ class Processes:
         return mean_loss, stops > 0
 
     def agree(self, model: nn.Module, step: int) -> None:
-        """Have all processes begin with the weights of the first one, after the same number of steps.
+        """Copy the weights of the first process to all others, and check that all have done the same number of steps.
 
         Args:
-            model: of the same shape everywhere.
-            step: steps done.
+            model: the model, with the same shapes in every process.
+            step: the number of steps done.
 
         Raises:
-            ValueError: another number of steps elsewhere.
+            ValueError: the processes have done different numbers of steps.
         """
         if self.count == 1:
             return
@@ -153,7 +156,7 @@ class Processes:
         if len(steps.unique()) > 1:
             raise ValueError(
                 f"step: expected one number of steps in all processes, got {steps.tolist()}; "
-                "--out is to be a folder that every node sees"
+                "give an --out folder that every node can read"
             )
         for value in model.state_dict().values():
             if value.numel():

@@ -1,4 +1,4 @@
-"""The forward pass of a step, for one of its objects."""
+"""The forward pass of a training step for one object."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ __all__ = ["ForwardOutput", "forward"]
 
 @dataclass(frozen=True)
 class ForwardOutput:
-    """What the losses of one object read.
+    """The result of the forward pass for one object, from which the losses are computed.
 
     Attributes:
-        episode: the object, as it was drawn.
+        episode: the object and its views.
         parameters: theta + delta.
-        field: that these make of the planes that are shown.
-        rendered: query rays.
-        truth: their colours.
-        generator: of the step and object, for a loss that draws something.
+        field: the field with these parameters and the planes that were not dropped.
+        rendered: the rendered query rays.
+        truth: the true colours of these rays.
+        generator: the generator of this step and object, for losses that draw random numbers.
     """
 
     episode: Episode
@@ -47,24 +47,24 @@ def forward(model: HyperPlanes, draw: Draw, update: Parameters, config: Training
     """Render random query rays of one object with its adapted weights (HyperPlanes, Algorithm 1).
 
     Args:
-        model: that is trained.
-        draw: the object, and what its rays, samples and augmentations are drawn from, in the order below.
-        update: delta of this object, which the hypernetwork has written.
-        config: of the training.
+        model: the model that is trained.
+        draw: the object, and the generator of its rays, samples and augmentations, in the order below.
+        update: delta of this object, which the hypernetwork has predicted.
+        config: the configuration of the training.
     """
     episode, generator = draw.episode, draw.generator
-    # hide some of the planes, where the model is trained to do without
+    # plane dropout, if it is configured
     prepared = drop_planes(episode.prepared, model.config.plane_dropout, generator)
-    # the field of theta + delta, which looks colours up in the planes (Eq. 6)
+    # the field of theta + delta, which reads colours from the planes (Eq. 6)
     parameters = model.theta + update
     field = model.field(prepared, parameters)
-    # random rays of the query views, and the colours and opacities seen there
+    # random rays of the query views, with their true colours and opacities
     subpixels = SUBPIXELS if config.antialias else SUBPIXELS[:1]
     with record_function("step:rays"), prefix_errors(draw.name):
         rays, truth, opacity = episode.query.sample_masked_rays(
             config.rays, generator=generator, among=episode.live, near_far=field.sampling.near_far, subpixels=subpixels
         )
-    # samples on the rays, the field at these, and their compositing (Eq. 1)
+    # place samples on the rays, evaluate the field there, and composite (Eq. 1)
     with record_function("step:rendering"):
         rendered = field.trace(rays, generator).pooled(len(subpixels))
     # the same random background behind prediction and truth

@@ -1,4 +1,4 @@
-"""The training of a gating network, after that of the model whose pictures it mixes with those of the visual hull."""
+"""The training of a gating network, which averages the pictures of a trained model with those of the visual hull."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from hyperplanes.views import Task, moved
 __all__ = ["GatingExample", "example_of", "fit_gate", "turned"]
 
 STEPS = 1500
-EXAMPLES, PIXELS = 16, 2048  # of a step, and of each of them
-SEED = 0  # of the weights and the draws
-RATE = 0.01  # of Adam, at first; it falls to nothing by a cosine
+EXAMPLES, PIXELS = 16, 2048  # examples per step, and pixels of each
+SEED = 0  # of the initial weights and the random draws
+RATE = 0.01  # initial learning rate of Adam; it decays to 0 along a cosine
 
 
 @dataclass(frozen=True)
 class GatingExample:
-    """Pixels of one object that is shown by some views, of those where either picture has anything.
+    """The pixels of the query views of one object in which the learned field or the visual hull is not transparent.
 
     Attributes:
-        read: what the gating network reads of them.
-        learned: by the learned field.
-        hull: by the visual hull.
-        truth: as they are.
-        error: sum of squared errors of the learned field over all pixels, by which those of the mean are divided.
+        read: the inputs of the gating network for these pixels.
+        learned: their colours, by the learned field.
+        hull: their colours, by the visual hull.
+        truth: their true colours.
+        error: sum of the squared errors of the learned field over all pixels of the query views; at least 1e-6.
     """
 
     read: Float[Tensor, "pixel 9"]
@@ -46,11 +46,11 @@ class GatingExample:
 
 @torch.no_grad()
 def example_of(model: HyperPlanes, task: Task) -> GatingExample:
-    """The pixels of an object's query views.
+    """The training example of one object.
 
     Args:
-        model: whose pictures are mixed with those of the hull.
-        task: an object that the model was not trained on, with masks.
+        model: the model whose pictures are averaged with those of the hull.
+        task: an object with masks, which the model was not trained on.
     """
     context = model.prepare(task.support)
     learned = model.rendering_field(context, model.adapted_weights(context)).render(task.query.cameras)
@@ -65,7 +65,7 @@ def example_of(model: HyperPlanes, task: Task) -> GatingExample:
 
 
 def turned(task: Task, generator: torch.Generator) -> Task:
-    """An object in a random orientation, as none of its kind stands: cameras are turned about the scene's centre."""
+    """The object in a uniformly random orientation: its cameras are rotated about the centre of the scene."""
     quaternion = torch.nn.functional.normalize(torch.randn(4, generator=generator, dtype=torch.float64), dim=0)
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3] = quaternion_to_rotation_matrix(quaternion[None])[0]
@@ -76,20 +76,20 @@ def turned(task: Task, generator: torch.Generator) -> Task:
 
 
 def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS) -> GatingNetwork:
-    """A gating network by gradient steps (Adam) on the squared error of means of two pictures.
+    """Train a gating network with Adam on the squared error of the average of two pictures.
 
-    Each example counts by its error relative to that of the learned field, so that PSNR rises on all alike.
+    The error of each example is divided by that of its learned field, so that all objects have the same weight in PSNR.
 
     Args:
-        examples: of objects, shown by all numbers of views; those of which neither picture shows anything are left out.
-        steps: of EXAMPLES drawn examples and PIXELS pixels of each.
+        examples: examples of objects, with all numbers of support views. Those without pixels are left out.
+        steps: number of steps, each on EXAMPLES random examples and PIXELS pixels of each.
 
     Raises:
-        ValueError: no example.
+        ValueError: no example with a pixel.
     """
     examples = [each for each in examples if len(each.read)]
     if not examples:
-        raise ValueError("examples: expected one of which a picture shows anything, got none")
+        raise ValueError("examples: expected at least one example with a pixel, got none")
     with seeded(SEED):
         gate = GatingNetwork().requires_grad_()
     descent = torch.optim.Adam(gate.parameters(), RATE)
@@ -106,7 +106,7 @@ def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS) -> Gating
 
 
 def _relative_error(gate: GatingNetwork, example: GatingExample, generator: torch.Generator) -> Tensor:
-    """The squared error of the mean of both pictures over that of the first, by some of the pixels."""
+    """The squared error of the average of both pictures, divided by that of the learned field; from random pixels."""
     pixels = torch.randint(len(example.read), (PIXELS,), generator=generator)
     share = gate(example.read[pixels])[:, None]
     mixed = torch.lerp(example.learned[pixels], example.hull[pixels], share)

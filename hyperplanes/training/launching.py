@@ -1,4 +1,7 @@
-"""One process a device, by Lightning Fabric or by torchrun, which sets the same environment variables."""
+"""Starts one process per device with Lightning Fabric, or joins those that torchrun has started.
+
+Both set the same environment variables.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,10 @@ from torch import distributed
 __all__ = ["count_processes", "launched"]
 
 PATIENCE = timedelta(hours=6)
-"""How long a process waits for another one, such as for the first one's validation."""
+"""How long a process waits for another one, for example while the first one validates."""
 
 GRACE = 5.0
-"""Seconds in which the processes that were started here may end by themselves, once this one has ended in an error."""
+"""Seconds that the processes started here have to end by themselves after an error in this process."""
 
 
 def _by_torchrun() -> bool:
@@ -27,18 +30,18 @@ def _by_torchrun() -> bool:
 
 
 def count_processes(devices: int, nodes: int) -> tuple[int, int]:
-    """Processes a node, and nodes: as torchrun says where it started this process, otherwise as asked for.
+    """The number of processes per node and the number of nodes. If torchrun started this process, it decides both.
 
     Args:
-        devices: asked for on each node.
-        nodes: asked for.
+        devices: the requested number of processes on each node.
+        nodes: the requested number of nodes.
 
     Returns:
-        Both.
+        Processes per node, and nodes.
 
     Raises:
-        ValueError: less than one, torchrun has started other numbers, or several nodes without a word on how they find
-            each other.
+        ValueError: a number below one, other numbers than torchrun has started, or several nodes without MASTER_ADDR,
+            MASTER_PORT and NODE_RANK in the environment.
     """
     for name, count in (("--devices", devices), ("--nodes", nodes)):
         if count < 1:
@@ -62,21 +65,21 @@ def count_processes(devices: int, nodes: int) -> tuple[int, int]:
 
 @contextmanager
 def launched(devices: int, nodes: int, device: torch.device) -> Generator[torch.device]:
-    """The time in which torch.distributed joins as many processes, of which this is one.
+    """A context in which this process is one of a group of torch.distributed.
 
-    Where nothing else has started the others of this node, this process does: each is this command once more, with a
-    LOCAL_RANK in its environment.
+    If nothing else has started the other processes of this node, this process starts them: each runs the same command,
+    with LOCAL_RANK in its environment.
 
     Args:
-        devices: processes a node, from `count_processes`.
-        nodes: that take part.
-        device: its kind is where each process computes.
+        devices: processes per node, from `count_processes`.
+        nodes: the number of nodes.
+        device: a device of the type on which each process computes.
 
     Yields:
         The device of this process.
 
     Raises:
-        ValueError: fewer GPUs than processes on this node.
+        ValueError: a device with an index for several processes, or fewer GPUs than processes on this node.
     """
     if devices * nodes == 1:
         yield device
@@ -88,7 +91,7 @@ def launched(devices: int, nodes: int, device: torch.device) -> Generator[torch.
     if device.type == "cuda" and torch.cuda.device_count() < devices:
         raise ValueError(
             f"--devices: expected at most the {torch.cuda.device_count()} GPUs of this machine, got {devices}; "
-            "--device cpu has as many processes as you like"
+            "--device cpu allows any number of processes"
         )
     from lightning_fabric import Fabric
     from lightning_fabric.strategies import DDPStrategy
@@ -110,17 +113,18 @@ def launched(devices: int, nodes: int, device: torch.device) -> Generator[torch.
 
 
 def _leave() -> None:
-    """Leave the group after an error: an interpreter that ends beside gloo's threads is aborted now and then.
+    """Leave the group after an error, because an interpreter that ends while gloo's threads run is sometimes aborted.
 
-    Of processes whose neighbour was killed 6 of 36 were, and none of 36 that left the group (PyTorch 2.13, two cores).
-    Collectives are synchronous, so none is under way. NCCL is not asked, which may wait for a process that has gone.
+    After another process was killed, 6 of 36 processes were aborted; of 36 that left the group, none was (PyTorch 2.13,
+    two cores). Collectives are synchronous, so none is running. With NCCL the group is not left, because NCCL may wait
+    for a process that has ended.
     """
     if distributed.is_initialized() and distributed.get_backend() == "gloo":
         distributed.destroy_process_group()
 
 
 def _end(started: Iterable[subprocess.Popen[bytes]]) -> None:
-    """Kill what has not ended after some time."""
+    """Kill the processes that have not ended after GRACE seconds."""
     deadline = time.monotonic() + GRACE
     for process in started:
         with suppress(subprocess.TimeoutExpired):

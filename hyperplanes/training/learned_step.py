@@ -1,4 +1,4 @@
-"""The training of learned steps of gradient descent, after that of the model that they follow."""
+"""The training of learned steps of gradient descent for a trained model."""
 
 from __future__ import annotations
 
@@ -26,26 +26,28 @@ from hyperplanes.views import Tasks
 
 __all__ = ["fit_learned_step"]
 
-RAYS = 1024  # of the views shown, from which a gradient is found
-STEPS = 4  # the step that is trained is the first of an object, or follows one, two or three others
-RATE, WARMUP, LAST = 1e-3, 100, 0.02  # of Adam at first, steps until then, and what share of it remains in the end
+RAYS = 1024  # of the support views, for the gradient that a learned step reads
+STEPS = 4  # the trained step of an object is its first, or follows one, two or three others
+RATE, WARMUP, LAST = 1e-3, 100, 0.02  # learning rate of Adam, steps of warm-up, and the final rate as a fraction
 
 
 def fit_learned_step(
     model: HyperPlanes, data: Tasks, config: TrainingConfig, *, on_step: Callable[[int, float], None] | None = None
 ) -> LearnedStep:
-    """Train learned steps of a model, whose own weights stay as they are.
+    """Train the learned step of a model, whose own weights do not change.
 
-    The loss is the squared error of query rays after a step. Of each object drawn, that step is one of the first STEPS.
+    The loss is the squared error of query rays after a learned step. For each object, this is a random one of its first
+    STEPS steps.
 
     Args:
-        model: with a hypernetwork that reads a volume. The training goes on from the learned step that it has, if any.
-        data: the objects that it was trained on, or others.
-        config: of the episodes, rays and number of the steps; rates and optimisers are those of this module.
-        on_step: called with the number of steps done and the loss of the last one.
+        model: a model whose hypernetwork reads a volume. If it has a learned step, the training continues from that.
+        data: the objects that the model was trained on, or others.
+        config: episodes, rays and the number of training steps. Rates and optimiser are those of this module.
+        on_step: called with the number of training steps done and the loss of the last one.
 
     Returns:
-        The network: the `learned_step` of the model, whose configuration then says how many it takes.
+        The network, for the attribute `learned_step` of a model. `learned_steps` in the model's configuration is how
+        often it is applied.
     """
     with seeded(config.seed):
         fitted = HyperPlanesNetwork(replace(model.config, learned_steps=1)).learned_step
@@ -72,7 +74,7 @@ def fit_learned_step(
 
 
 def _gradients(model: HyperPlanes, fitted: LearnedStep, draws: Sequence[Draw], config: TrainingConfig) -> float:
-    """Set the gradients of the network for the objects of a step; returns the mean loss."""
+    """Set the gradients of the learned step for the objects of a training step; returns the mean loss."""
     with torch.no_grad():
         updates = model.updates([draw.episode.prepared for draw in draws])
     started = [_after_others(model, fitted, draw, update) for draw, update in zip(draws, updates, strict=True)]
@@ -93,7 +95,7 @@ def _gradients(model: HyperPlanes, fitted: LearnedStep, draws: Sequence[Draw], c
 def _after_others(
     model: HyperPlanes, fitted: LearnedStep, draw: Draw, update: Parameters
 ) -> tuple[Parameters, tuple[Tensor, Tensor, Tensor]]:
-    """The update of an object after a random number of learned steps, and what the next of them reads."""
+    """The update of an object after a random number of learned steps, and the inputs of the next one."""
     episode, theta = draw.episode, model.theta.detach()
 
     def inputs() -> tuple[Tensor, Tensor, Tensor]:

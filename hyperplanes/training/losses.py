@@ -1,4 +1,4 @@
-"""The losses of a step: a list of callables, each with its weight, that read what the forward pass returned."""
+"""The losses of a training step: callables that take the result of the forward pass. Each applies its own weight."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ __all__ = ["EmptinessLoss", "VolumeLoss", "losses_of", "photometric_loss", "thin
 
 
 def losses_of(config: TrainingConfig) -> list[Callable[[ForwardOutput], Tensor]]:
-    """The losses that a training is configured with, in the order in which they are summed.
+    """The losses of a training, in the order in which they are summed.
 
     Args:
-        config: its `empty_points` and `volume_loss` switch two of them on; the photometric loss is always there.
+        config: the photometric loss is always included; `empty_points` and `volume_loss` each add another.
     """
     losses: list[Callable[[ForwardOutput], Tensor]] = [photometric_loss]
     if config.empty_points:
@@ -36,31 +36,31 @@ def losses_of(config: TrainingConfig) -> list[Callable[[ForwardOutput], Tensor]]
 
 
 def photometric_loss(output: ForwardOutput) -> Tensor:
-    """The mean squared error of the colours of query rays (HyperPlanes, Eq. 8), that of a coarse pass added (Eq. 2)."""
+    """The mean squared error of the colours of query rays (HyperPlanes, Eq. 8), plus that of a coarse pass (Eq. 2)."""
     return ray_loss(output.rendered, output.truth)
 
 
 def thin_opacity(density: Float[Tensor, " point"], bounds: Sphere) -> Float[Tensor, " point"]:
-    """The opacity of a layer a tenth of a radius thick, which does not depend on the unit of the world."""
+    """The opacity of a layer that is a tenth of the radius thick; it does not depend on the unit of the world."""
     return 1 - torch.exp(-density * bounds.radius / 10)
 
 
 @dataclass(frozen=True)
 class EmptinessLoss:
-    """Teaches a field to be empty outside the visual hull, which packed training never samples.
+    """Penalises density outside the visual hull, where training with packed samples never evaluates the field.
 
-    The mean `thin_opacity` of random points of the sphere, of which those in the hull count as empty.
+    The loss is the mean `thin_opacity` of random points in the sphere of the scene; points in the hull count as 0.
 
     Attributes:
-        points: of the sphere, an object and step.
-        weight: beside the squared error of pixels.
+        points: the number of random points per object and step.
+        weight: the factor of this loss; that of the squared error of pixels is 1.
     """
 
     points: int
     weight: float = 0.01
 
     def __call__(self, output: ForwardOutput) -> Tensor:
-        """The opacity outside the hull of one object, of its field and of its proposal."""
+        """The loss of the field of one object, plus that of its proposal field if it has one."""
         field = output.field
         bounds, device = field.occupancy.bounds, field.occupancy.occupied.device
         with record_function("step:emptiness"):
@@ -72,14 +72,14 @@ class EmptinessLoss:
 
 @dataclass(frozen=True)
 class VolumeLoss:
-    """How far the first features of the grid are from the hull and the colours of all views of the object.
+    """The difference of the first features of the grid from the visual hull and the mean colours of all views.
 
-    Teaches a hypernetwork what objects look like where the views that it reads do not show them. The cross entropy of
-    the occupied share, of which feature 0 is the logit, over the cells that the hull of the views shown leaves, plus
-    the squared error of the colours, features 1 to 3, over those that are occupied.
+    The hypernetwork learns from it the shape and colour of parts that its support views do not show. The loss is the
+    cross entropy of the occupied share of each cell, whose logit is feature 0, over the cells in the hull of the
+    support views, plus the squared error of the colours, features 1 to 3, weighted by the true occupied share.
 
     Attributes:
-        weight: beside the squared error of pixels.
+        weight: the factor of this loss; that of the squared error of pixels is 1.
     """
 
     weight: float
@@ -90,10 +90,10 @@ class VolumeLoss:
         assert shown is not None
         assert target is not None
         grid = output.parameters["fine.grid.weight"][:VOLUME_CHANNELS]
-        # only cells that the views shown leave: what they rule out, the field never evaluates
+        # only cells in the hull of the support views: the field is never evaluated in others
         left = shown[0] > 0
         cells, truth = grid[:, left], target[:, left].to(grid)
         entropy = binary_cross_entropy_with_logits(cells[0], truth[0])
-        # a cell counts for its colour as far as it is occupied
+        # the error of a colour is weighted by the occupied share of the cell
         error = ((cells[1:] - truth[1:]).square().mean(0) * truth[0]).sum() / truth[0].sum().clamp_min(1)
         return self.weight * (entropy + error)

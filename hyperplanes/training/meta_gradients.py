@@ -1,4 +1,4 @@
-"""The gradients of meta-learning: of MAML (Finn et al. 2017) and of Reptile (Nichol et al. 2018)."""
+"""The gradients of two methods of meta-learning: MAML (Finn et al. 2017) and Reptile (Nichol et al. 2018)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Loss: TypeAlias = Callable[[Parameters], Tensor]
 def maml_gradient(
     theta: Mapping[str, Tensor], inner: Sequence[Loss], outer: Loss, rate: float, *, first_order: bool = False
 ) -> tuple[Parameters, Tensor]:
-    """The gradient in theta of the loss after gradient steps from theta: outer(theta_K), through all K steps.
+    """The gradient with respect to theta of outer(theta_K), the loss after K gradient steps from theta.
 
     theta_0 = theta, theta_{i+1} = theta_i - rate grad inner_i(theta_i).
 
     Args:
         theta: the initialisation.
-        inner: the loss of each gradient step on an object.
-        outer: the loss after the last of them.
-        rate: of the steps.
-        first_order: take the gradients of the inner losses as constants, so that no second derivative is needed.
+        inner: the loss of each of the K gradient steps on an object.
+        outer: the loss after these steps.
+        rate: the learning rate of the steps.
+        first_order: treat the gradients of the inner losses as constants, so that no second derivative is needed.
 
     Returns:
         The gradient, and the value of the outer loss.
@@ -48,21 +48,21 @@ def maml_gradient(
 
 
 def _gradient(value: Tensor, parameters: Parameters, *, create_graph: bool = False) -> Parameters:
-    """The gradient of a scalar; zero where it does not depend on a parameter."""
+    """The gradient of a scalar; zero for parameters that it does not depend on."""
     found = torch.autograd.grad(value, list(parameters.values()), create_graph=create_graph, materialize_grads=True)
     return Parameters(zip(parameters, found, strict=True))
 
 
 @torch.no_grad()
 def reptile_gradient(theta: Mapping[str, Tensor], adapted: Sequence[Mapping[str, Tensor]]) -> Parameters:
-    """Theta minus the mean of the weights that descent on each of some objects led to.
+    """Theta minus the mean of the weights after gradient descent on each of several objects.
 
-    A step of gradient descent along it, at rate e, is Reptile's theta + e (mean - theta); Tancik et al. 2021 give it to
-    Adam.
+    A gradient step with this gradient and learning rate e is Reptile's theta + e (mean - theta). Tancik et al. 2021
+    pass it to Adam.
 
     Args:
         theta: the initialisation.
-        adapted: the weights after descent, of each object.
+        adapted: the weights of each object after gradient descent.
     """
     return Parameters(
         (name, value - torch.stack([each[name] for each in adapted]).mean(0)) for name, value in theta.items()

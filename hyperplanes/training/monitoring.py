@@ -1,4 +1,4 @@
-"""What can be seen of a training: its curve, gradient norms, speed, held-out views, and all that in TensorBoard."""
+"""The reports of a training: its curve, gradient norms, speed and held-out views, also for TensorBoard."""
 
 from __future__ import annotations
 
@@ -24,17 +24,16 @@ __all__ = ["Progress", "Samples", "Speed", "TensorBoard", "gradient_norms", "wri
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a training stands.
+    """The progress of a training.
 
     Attributes:
         step: steps done.
-        steps: steps to do.
-        loss: mean squared error of the last step's rays, plus what `volume_loss` and `empty_points` add.
-        rays_per_second: since the last report.
-        psnr: in dB, of some views of held-out objects, where this step validated on them.
-        seconds_left: by the speed so far.
-        diagnostics: of the hypernetwork on those objects.
-        ssim: of the same views, where they are large enough for it.
+        steps: steps to do in all.
+        loss: mean squared error of the last step's rays, plus the losses of `volume_loss` and `empty_points`.
+        rays_per_second: the speed since the last report.
+        psnr: mean PSNR in dB of some views of held-out objects; None if this step had no validation.
+        seconds_left: an estimate from the speed so far.
+        diagnostics: diagnostics of the hypernetwork on those objects, if the step had a validation.
     """
 
     step: int
@@ -44,7 +43,6 @@ class Progress:
     psnr: float | None
     seconds_left: float
     diagnostics: Diagnostics | None = None
-    ssim: float | None = None
 
 
 @dataclass(frozen=True)
@@ -52,8 +50,8 @@ class Samples:
     """Views of held-out objects.
 
     Attributes:
-        pictures: (view, 3, height, width) as the model renders them, an object each.
-        truth: as they are.
+        pictures: for each object, its rendered views (view, 3, height, width).
+        truth: the true images of the same views.
     """
 
     pictures: Sequence[Tensor]
@@ -66,22 +64,26 @@ class Samples:
 
     @property
     def ssim(self) -> float | None:
-        """Mean structural similarity; None of pictures that are smaller than its window."""
+        """Mean structural similarity; None if pictures are smaller than its window of 11 pixels."""
         if min(side for truth in self.truth for side in truth.shape[-2:]) < 11:
             return None
         return float(torch.cat([ssim(seen.clamp(0, 1), truth) for seen, truth in self.pairs]).mean())
 
     def sheet(self) -> npt.NDArray[np.uint8]:
-        """A picture (row, column, 3): a view a row, the prediction left of the truth (objects of the first's size)."""
+        """An image (row, column, 3) with one view per row, the prediction left of the truth.
+
+        It has only objects whose views have the size of those of the first.
+        """
         first = self.truth[0].shape[-2:]
         rows = [to_pixels(torch.cat(pair, -1)) for pair in self.pairs if pair[1].shape[-2:] == first]
         return np.concatenate([row for rows_of_one in rows for row in rows_of_one])
 
 
 def write_curve(path: Path, curve: Sequence[Mapping[str, float]]) -> None:
-    """Write the reports of a training as CSV: a row a report, a column a quantity, empty where it was not measured.
+    """Write the reports of a training as CSV, with one row per report; quantities that were not measured are empty.
 
-    Steps and losses come first, then the others by name, whatever the order of the rows of a training that went on.
+    The columns are step, loss, and the other quantities in alphabetical order, so that a resumed training has the same
+    order.
     """
     columns = ["step", "loss", *sorted({name for row in curve for name in row} - {"step", "loss"})]
     write_whole(path, csv_table(columns, [[row.get(name) for name in columns] for row in curve]).encode())
@@ -89,7 +91,7 @@ def write_curve(path: Path, curve: Sequence[Mapping[str, float]]) -> None:
 
 @torch.no_grad()
 def gradient_norms(model: HyperPlanes) -> dict[str, float]:
-    """Norms of the gradients of the last step, after clipping: of theta and of the hypernetwork, where there is one."""
+    """Norms of the gradients of the last step, after clipping: of theta and, if there is one, of the hypernetwork."""
     found = {}
     for name, part in {"theta": model.networks, "hypernetwork": model.hypernetwork}.items():
         gradients = [] if part is None else [each.grad for each in part.parameters() if each.grad is not None]
@@ -99,7 +101,7 @@ def gradient_norms(model: HyperPlanes) -> dict[str, float]:
 
 
 class Speed:
-    """Rays a second since the last report, and the seconds that the remaining steps will take."""
+    """Measures the rays per second since the last report, and estimates the seconds for the remaining steps."""
 
     def __init__(self, step: int, steps: int, rays: int) -> None:
         self._first, self._steps, self._rays = step, steps, rays
@@ -107,23 +109,23 @@ class Speed:
         self._reported = (self._began, step)
 
     def rays_per_second(self, step: int) -> float:
-        """Since the last report; what comes between reports and steps, such as validation, is not counted."""
+        """The speed since the last report. Time between a report and the next step, as for validation, is excluded."""
         before, reported = self._reported
         return (step - reported) * self._rays / max(time.perf_counter() - before, 1e-9)
 
     def seconds_left(self, step: int) -> float:
-        """By the speed so far, all included; a report ends here, and the next one begins."""
+        """An estimate from the speed so far, including validation. The time of the next report begins here."""
         now = time.perf_counter()
         self._reported = (now, step)
         return (now - self._began) / (step - self._first) * (self._steps - step)
 
 
 class TensorBoard:
-    """Event files for TensorBoard: the quantities of the curve, and the held-out views.
+    """Writes event files for TensorBoard: the quantities of the curve, and the held-out views.
 
     Args:
-        folder: for the event files.
-        step: steps done before; what an interrupted training wrote after them is not shown.
+        folder: the folder for the event files.
+        step: steps done before. Events of later steps, from a training that was interrupted, are not shown.
 
     Raises:
         ValueError: the package tensorboard is not installed.
@@ -139,7 +141,7 @@ class TensorBoard:
         self._writer = SummaryWriter(folder, purge_step=step + 1 if step else None)
 
     def add(self, row: Mapping[str, float], samples: Samples | None = None) -> None:
-        """One report."""
+        """Write one report."""
         step = int(row["step"])
         for name, value in row.items():
             if name != "step":
@@ -149,5 +151,5 @@ class TensorBoard:
         self._writer.flush()
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write buffered events and close the files."""
         self._writer.close()

@@ -1,4 +1,4 @@
-"""How the gradient of a step is found: here, by backpropagating the losses of rendered rays."""
+"""The objective of a training: the class that computes the gradient of a step. Here: losses of rendered rays."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ __all__ = ["Objective", "RenderingObjective"]
 
 
 class Objective(ABC):
-    """What a training does with the objects of a step, and how it is judged.
+    """Computes the gradients of a training step, and adapts held-out objects for validation.
 
     Attributes:
-        updates: the updates of theta of the last step, an object each; none where it has none.
+        updates: for each object of the last step, its update of theta; empty if the objective has no updates.
 
     Args:
-        model: trained in place.
-        config: of the training.
+        model: the model, which is trained in place.
+        config: the configuration of the training.
     """
 
     def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
@@ -42,16 +42,16 @@ class Objective(ABC):
 
     @property
     def rays_per_step(self) -> int:
-        """Rays of all objects of a step."""
+        """The number of rays in a step, over all objects."""
         return self.config.rays * self.config.tasks
 
     def tasks(self, data: Tasks) -> Tasks:
-        """The tasks as this training shows them to the model: as they are."""
+        """The tasks to train on; by default they are not changed."""
         return data
 
     @abstractmethod
     def gradients(self, batch: Batch) -> float:
-        """Set the gradients of the model's weights for this process's objects; returns the mean loss of these."""
+        """Set the gradients of the model's weights for the objects of this process; returns their mean loss."""
 
     @abstractmethod
     def adapt(self, prepared: SupportContext) -> AdaptedField:
@@ -59,11 +59,11 @@ class Objective(ABC):
 
 
 class RenderingObjective(Objective):
-    """The losses of query rays rendered with theta + delta, by backpropagation (HyperPlanes, Algorithm 1).
+    """Backpropagates the losses of query rays that are rendered with theta + delta (HyperPlanes, Algorithm 1).
 
     Args:
-        model: with a hypernetwork, or a target alone.
-        config: of the training.
+        model: a model with a hypernetwork, or a target network alone.
+        config: the configuration of the training.
     """
 
     def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
@@ -86,20 +86,20 @@ class RenderingObjective(Objective):
             output = forward(self.model, batch.rendered[place], leaves[place], self.config)
             return sum((each(output) for each in self.losses), torch.zeros(())) / len(batch.rendered)
 
-        # back from the rays of each object to theta and to its update
+        # backward pass from the rays of each object to theta and to its update
         variables = [*weights, *(value for update in leaves for value in update.values())]
         total, found = summed_gradients(loss, len(batch.rendered), variables, thread_safe=thread_safe)
         of_weights, of_updates = found[: len(weights)], found[len(weights) :]
         for value, gradient in zip(weights, of_weights, strict=True):
             value.grad = gradient
-        # and from those updates that the losses depend on, if a hypernetwork wrote any, through it
+        # backward pass through the hypernetwork, from those updates on which the losses depend
         gradients = iter(of_updates)
         ends = [[(value, next(gradients)) for update in group for value in update.values()] for group in written]
         ends = [[(value, found) for value, found in group if found is not None] for group in ends]
         ends = [group for group in ends if group]
 
         def written_loss(part: int) -> Tensor:
-            """Whose gradients are those of the losses at the updates of a group."""
+            """A scalar whose gradient with respect to the updates of a group is that of the losses."""
             return torch.stack([(value * found).sum() for value, found in ends[part]]).sum()
 
         if ends:
@@ -109,10 +109,11 @@ class RenderingObjective(Objective):
         return float(total)
 
     def _groups(self, objects: list[SupportContext]) -> list[list[SupportContext]]:
-        """The objects that go through the hypernetwork together: all of them, since it may compare them.
+        """The objects in groups that go through the hypernetwork together.
 
-        One that reads volumes reads each alone. There every thread has a group, where there are two objects for each:
-        PyTorch's convolutions of single volumes, back and forth, take three times as long.
+        All objects are one group, because the hypernetwork may standardise codes over them. One that reads volumes
+        treats each object alone: on a CPU with two or more objects per thread, each thread gets a group, because
+        forward and backward passes through PyTorch's convolutions of single volumes take three times as long.
         """
         threads, total = torch.get_num_threads(), len(objects)
         apart = self.model.reads_volume and self.model.rig.device.type == "cpu" and threads <= total // 2
@@ -122,9 +123,9 @@ class RenderingObjective(Objective):
 
     @torch.enable_grad()
     def _write(self, objects: list[SupportContext]) -> list[Parameters]:
-        """The updates of a group, with their graph, in whatever thread."""
+        """The updates of a group, with their graph; it may run in any thread."""
         return self.model.updates(objects, mixed_precision=self.mixed_precision)
 
     def adapt(self, prepared: SupportContext) -> AdaptedField:
-        """The field of a held-out object, in a single step."""
+        """The field of a held-out object after one forward pass."""
         return self.model.adapt_to(prepared)

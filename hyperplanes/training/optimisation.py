@@ -1,4 +1,4 @@
-"""The optimisers of a training: one set for theta, one for the hypernetwork, and the schedule of their rates."""
+"""The optimisers of theta and of the hypernetwork, and the schedule of their learning rates."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class Optimisation:
     """The optimisers of theta and of the hypernetwork (HyperPlanes, Algorithm 1: separate Adam steps).
 
     Args:
-        model: whose weights they move.
+        model: the model whose weights they update.
         config: rates, schedule and clipping.
 
     Attributes:
-        optimisers: those of theta first.
-        parameters: all that they move.
+        optimisers: all optimisers, those of theta first.
+        parameters: all parameters that they update.
     """
 
     def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
@@ -38,16 +38,16 @@ class Optimisation:
 
     @property
     def parameters(self) -> Sequence[Tensor]:
-        """All that the optimisers move."""
+        """All parameters that the optimisers update."""
         return [value for each in self.optimisers for group in each.param_groups for value in group["params"]]
 
     def zero_grad(self) -> None:
-        """Forget the gradients of the step before."""
+        """Set all gradients to None."""
         for optimiser in self.optimisers:
             optimiser.zero_grad(set_to_none=True)
 
     def step(self, number: int) -> None:
-        """Move the weights along their gradients, after `number` steps."""
+        """Clip the gradients and update the weights, after `number` steps."""
         for optimiser, rate in zip(self.optimisers, self._rates, strict=True):
             optimiser.param_groups[0]["lr"] = rate * self.rate_factor(number)
         if self.config.clip:
@@ -56,7 +56,7 @@ class Optimisation:
             optimiser.step()
 
     def rate_factor(self, number: int) -> float:
-        """What rates are multiplied by after `number` steps: from 0 to 1 in the warm-up, then along half a cosine."""
+        """The factor of all learning rates after `number` steps: linear warm-up to 1, then cosine decay."""
         config = self.config
         if number < config.warmup:
             return (number + 1) / config.warmup

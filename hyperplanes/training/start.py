@@ -1,4 +1,4 @@
-"""A training by what is configured: of a model, or of an initialisation."""
+"""Starts or resumes the training of a model or of an initialisation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hyperplanes.views import Tasks
 __all__ = ["start_training"]
 
 INITIAL = "initial.json"
-"""In the folder of a training: the checkpoint that it began with."""
+"""The file, in the folder of a training, that names the checkpoint whose weights it began with."""
 
 ARCHITECTURE = ("target", "network", "hypernetwork", "autoencoder", "coarse_network")
 MOST = 8  # entries of a configuration that a message names
@@ -36,21 +36,21 @@ def start_training(
     device: torch.device | str = "cpu",
     reference: Path | None = None,
 ) -> Trainer:
-    """A new training, or the one that was interrupted in `folder`.
+    """A new training, or the interrupted training in `folder`.
 
     Args:
-        config: of the model.
-        training: how it is trained; its seed is that of the first weights, too.
+        config: the configuration of the model.
+        training: the configuration of the training; its seed also determines the initial weights.
         data: tasks with a "train" split.
-        folder: for checkpoints.
-        device: where to compute.
-        reference: the checkpoint whose weights a new training begins with; for mv_matched that of mv_meta, which it is
-            to match.
+        folder: the folder for checkpoints.
+        device: the device to train on.
+        reference: the checkpoint whose weights a new training begins with; for mv_matched, the checkpoint of mv_meta
+            that is matched.
 
     Returns:
-        A trainer; its `step` says how far it is. CheckpointError where the folder holds another model or training,
-        ValueError for a reference with other weights than `config` says, or another than the training began with, and
-        for fewer support views than planes.
+        A trainer; its `step` is the number of steps done. CheckpointError if the folder has another model or training.
+        ValueError if the reference does not have the weights of `config` or is not the one that the training began
+        with, or if there are fewer support views than planes.
     """
     matching = config.initialisation is not None and config.initialisation.method == "mv_matched"
     model = HyperPlanes(config, training.seed + matching).to(device)  # not the weights that mv_meta began with
@@ -70,19 +70,19 @@ def start_training(
 
 
 def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
-    """Set the weights of a new training, and note in its folder where they are from.
+    """Set the weights of a new training to those of a checkpoint, and record the checkpoint in its folder.
 
-    A training that goes on has its own weights; the reference is then only compared with that note, if it is there.
+    A training that is resumed keeps its own weights; the checkpoint is then only compared with the recorded one.
 
     Raises:
-        ValueError: weights of another model, or a training that began with others.
+        ValueError: weights of another model, or a training that began with other weights.
     """
     if _goes_on(reference, folder):
         return
     found = HyperPlanes.from_pretrained(reference)
-    if model.gate is None:  # a gating network is trained after the model, on what that shows
+    if model.gate is None:  # the model is trained before its gating network
         found.gate = None
-    if model.learned_step is None:  # as is this one
+    if model.learned_step is None:  # and before its learned step
         found.learned_step = None
     if _shapes(model) != _shapes(found):
         config, names = found.config, model.config.differences(found.config)
@@ -102,10 +102,10 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
 
 
 def _goes_on(reference: Path, folder: Path) -> bool:
-    """Whether a training in a folder goes on; a reference is then compared with the one that it began with.
+    """Whether a folder has a training to resume; if so, the reference must be the one that it began with.
 
     Raises:
-        ValueError: another one.
+        ValueError: another reference.
     """
     if not (folder / "training.json").exists():
         return False
@@ -118,7 +118,7 @@ def _goes_on(reference: Path, folder: Path) -> bool:
 
 
 def _note(reference: Path, folder: Path) -> None:
-    """Write into the folder of a new training which weights it begins with, or is to match."""
+    """Record in the folder of a new training the checkpoint that it begins with or is matched to."""
     weights = checkpoint_folder(reference) / "model.safetensors"
     write_json(folder / INITIAL, {"checkpoint": str(reference), "sha256": sha256(weights.read_bytes())})
 
@@ -127,7 +127,7 @@ def _check_views(model: HyperPlanes, tasks: Tasks) -> None:
     """Refuse data whose first object has fewer support views than the model has planes.
 
     Raises:
-        ValueError: fewer; the message says what `train --support` can do about it.
+        ValueError: fewer views; the message names a value for `train --support`.
     """
     planes, names = len(model.known_rig), sorted(tasks.names("train"))
     if not planes or not names:

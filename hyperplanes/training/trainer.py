@@ -1,4 +1,4 @@
-"""Meta-training: theta and the hypernetwork by separate Adam steps on query rays (HyperPlanes, Algorithm 1)."""
+"""Meta-training of theta and the hypernetwork by separate Adam steps on query rays (HyperPlanes, Algorithm 1)."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ from hyperplanes.views import Tasks
 __all__ = ["Trainer", "train"]
 
 REPORT_EVERY = 25
-"""Steps between reports; every validation is reported too."""
+"""Steps between reports; there is also a report after every validation."""
 
 
 class Trainer:
-    """The loop of one training, and how far it is.
+    """The loop of one training.
 
-    Every step draws its objects from a generator seeded by (seed, step), and each object its rays from one seeded by
-    (seed, step, place in the step), so a training that is stopped and resumed ends exactly where an uninterrupted one
-    does. It computes where the model is.
+    The objects of a step are drawn with a generator seeded by (seed, step), and the rays of each object with one seeded
+    by (seed, step, place in the step). So a training that is stopped and resumed gives the same weights as an
+    uninterrupted one. It computes on the device of the model.
 
-    In a process of several (`launching.launched`) it renders its share of the objects of each step; the first process
-    alone writes files and validates on held-out objects.
+    If several processes share a training (`launching.launched`), each renders its share of the objects of a step. Only
+    the first process writes files and validates on held-out objects.
 
     Args:
-        model: trained in place.
-        data: tasks with a "train" split and perhaps a "val" or "test" split.
-        config: how.
-        folder: for checkpoints; a training that lies there already goes on.
-        objective: how the gradient of a step is found; by the losses of rendered rays where absent.
+        model: the model, which is trained in place.
+        data: tasks with a "train" split and optionally a "val" or "test" split.
+        config: the configuration of the training.
+        folder: the folder for checkpoints; a training in it is resumed.
+        objective: computes the gradients of a step; by default those of the losses of rendered rays.
 
     Raises:
         ValueError: no object to train on, or objects that the processes cannot share evenly.
@@ -67,7 +67,7 @@ class Trainer:
         self.model, self.processes = model, Processes.current()
         self.diagnostics: Diagnostics | None = None
         self.samples: Samples | None = None
-        self.stopping = False  # set by whoever wants `run` to end after the step at hand
+        self.stopping = False  # set it to end `run` after the current step
         self._stopped = False  # what the processes agreed on in the last step
         names = training_names(data)
         check_training(config, model.config)
@@ -77,7 +77,7 @@ class Trainer:
         self.folder = folder if self.processes.first else None
         self.optimisation = Optimisation(model, config)
         self.checkpointing = Checkpointing(folder, model, self.optimisation, config, self.processes.first)
-        if not (self.checkpointing.resumable or model.rig.any()) and self.processes.first:  # the others get it below
+        if not (self.checkpointing.resumable or model.rig.any()) and self.processes.first:  # `agree` copies it below
             with prefix_errors(names[0]):
                 model.set_rig(data.task(names[0]).support)
         self.objective: Objective = objective or RenderingObjective(model, config)
@@ -90,14 +90,14 @@ class Trainer:
             self.processes.agree(model, self.step)
 
     def run(self) -> Iterator[Progress]:
-        """Train until the last step, reporting every 25 steps; checkpoints are written on the way and at the end.
+        """Train until the last step, with a report every 25 steps and checkpoints at intervals and at the end.
 
-        With them come curve.csv and samples/STEP.png, held-out views beside the truth, and best/, the model of the
-        validation with the highest PSNR. Once `stopping` is set in any process, the step at hand is the last one, and a
-        checkpoint of it is written.
+        It also writes curve.csv, samples/STEP.png with held-out views beside the truth, and best/, the model with the
+        highest PSNR of all validations. If `stopping` is set in any process, training ends after the current step with
+        a checkpoint.
 
         Yields:
-            Where the training stands.
+            The progress at each report.
         """
         try:
             with other_processes():
@@ -107,24 +107,24 @@ class Trainer:
 
     def _run(self) -> Iterator[Progress]:
         if self.processes.first and self.step < self.config.steps:
-            self.validator.prepare()  # a bad held-out object ends the training before steps are lost with it
+            self.validator.prepare()  # an invalid held-out object ends the training before any step is taken
         config, speed = self.config, Speed(self.step, self.config.steps, self.objective.rays_per_step)
         while self.step < config.steps:
-            # the next objects are made ready by a thread while this step is taken
+            # a thread prepares the next objects during this step
             self.loader.expect(self.step)
             loss = self.take_step()
-            # what is due after this step
+            # what to do after this step
             step, last = self.step, self.step == config.steps
             validating = step % config.evaluate_every == 0 or last
             reporting = validating or step % REPORT_EVERY == 0
             stopping = self._stopped if self.processes.count > 1 else self.stopping
             saving = step % config.checkpoint_every == 0 or last or stopping
-            # held-out objects, by the first process alone
+            # validate on held-out objects, in the first process alone
             rays_per_second = speed.rays_per_second(step)
             found = self.validate() if validating and self.processes.first else None
             if found is not None and found.psnr > self._best:
                 self.checkpointing.save_best()
-            # the curve, the pictures, and the state to go on from
+            # write the curve, the pictures and the checkpoint
             if reporting:
                 self.curve.append(self._row(loss, found))
             if self.folder is not None and (validating or saving):
@@ -133,13 +133,13 @@ class Trainer:
                 self.save()
             if reporting:
                 left = speed.seconds_left(step)
-                seen = (None, None, None) if found is None else (found.psnr, found.diagnostics, found.ssim)
-                yield Progress(step, config.steps, loss, rays_per_second, seen[0], left, seen[1], seen[2])
+                seen = (None, None) if found is None else (found.psnr, found.diagnostics)
+                yield Progress(step, config.steps, loss, rays_per_second, seen[0], left, seen[1])
             if stopping:
                 return
 
     def take_step(self) -> float:
-        """One step of the optimisers on freshly drawn objects and rays; returns the loss."""
+        """Take one training step on newly drawn objects and rays; returns the loss."""
         self.model.train()
         self.optimisation.zero_grad()
         # draw this process's objects of the step
@@ -147,7 +147,7 @@ class Trainer:
             batch = self.loader.batch(self.step)
         # forward pass, losses and backward pass
         loss = self.objective.gradients(batch)
-        # the mean gradient and loss of all processes, and whether any is to stop
+        # average gradients and losses over the processes, and find out whether any is to stop
         with record_function("step:exchange"):
             loss, self._stopped = self.processes.average(self.optimisation.parameters, loss, self.stopping)
         self.stopping = self.stopping or self._stopped
@@ -156,28 +156,28 @@ class Trainer:
                 f"step {self.step + 1}, on {', '.join(batch.names)}: expected a finite loss, got {loss}; the last "
                 "checkpoint is kept; check the images of these objects, or train with lower rates"
             )
-        # move theta and the hypernetwork
+        # update theta and the hypernetwork
         with record_function("step:optimisers"):
             self.optimisation.step(self.step)
         self.step += 1
         return loss
 
     def validate(self) -> Validation | None:
-        """PSNR of query views of held-out objects, and the diagnostics there; None without such objects."""
+        """Render query views of held-out objects and compare them; None without such objects."""
         found = self.validator.run()
         if found is not None:
             self.samples, self.diagnostics = found.samples, found.diagnostics or self.diagnostics
         return found
 
     def save(self) -> None:
-        """Write model and training state to the folder, where there is one; whole or not at all."""
+        """Write the model and the state of the training to the folder, if there is one."""
         self.checkpointing.save(self.step, self.curve, self.diagnostics, self.loader)
 
     @torch.no_grad()
     def norms(self) -> dict[str, float]:
-        """Norms of the last step: of the gradient of each part, and of its objects' updates (root mean square).
+        """Norms in the last step: of the gradients of each part, after clipping, and of the updates (root mean square).
 
-        Gradients are clipped. Where there are several processes, all of them are to ask.
+        If several processes share the training, all of them must call this method.
         """
         found, updates = gradient_norms(self.model), self.objective.updates
         if self.model.hypernetwork is not None and updates:
@@ -186,7 +186,7 @@ class Trainer:
         return found
 
     def _row(self, loss: float, found: Validation | None) -> dict[str, float]:
-        """A point of the curve."""
+        """A row of the curve."""
         row = {"step": self.step, "loss": loss, **self.norms()}
         if found is not None:
             row["psnr"] = found.psnr
@@ -195,7 +195,7 @@ class Trainer:
         return row
 
     def _write(self, folder: Path, found: Validation | None) -> None:
-        """The curve as CSV, and the pictures of a validation."""
+        """Write the curve as CSV, and the pictures of a validation."""
         write_curve(folder / "curve.csv", self.curve)
         if found is not None:
             write_whole(folder / "samples" / f"{self.step:08d}.png", encode_png(found.samples.sheet()))
@@ -213,14 +213,14 @@ def train(
     folder: Path | None = None,
     report: Callable[[Progress], None] | None = None,
 ) -> Trainer:
-    """Run a training, resumed from `folder` where it holds one.
+    """Run a training to the end. If `folder` has an interrupted training, it is resumed.
 
     Args:
-        model: trained in place.
+        model: the model, which is trained in place.
         data: tasks, as in `Trainer`.
-        config: how.
-        folder: for checkpoints.
-        report: called with every progress.
+        config: the configuration of the training.
+        folder: the folder for checkpoints.
+        report: called with the progress at each report.
 
     Returns:
         The finished training.

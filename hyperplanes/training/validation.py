@@ -1,4 +1,4 @@
-"""Evaluation during training: some query views of held-out objects, rendered and compared."""
+"""Validation during training: some query views of held-out objects are rendered and compared."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ VIEWS = 2  # query views of each object
 
 @dataclass(frozen=True)
 class Validation:
-    """What held-out objects show of a model.
+    """The results on held-out objects.
 
     Attributes:
         psnr: mean over the views, in dB.
-        ssim: likewise; None of pictures that are smaller than its window.
-        samples: the views themselves.
-        diagnostics: of the hypernetwork, where there is one and at least two objects to compare the updates of.
+        ssim: mean over the views; None if pictures are smaller than its window.
+        samples: the rendered views and the true images.
+        diagnostics: diagnostics of the hypernetwork; None without a hypernetwork, or with fewer than two objects.
     """
 
     psnr: float
@@ -42,15 +42,15 @@ class Validation:
 
 
 class Validator:
-    """Renders query views of the same held-out objects each time.
+    """Renders the same query views of the same held-out objects each time.
 
-    The objects are those of the "val" split, or of "test" where a data set has no other; nothing but best/ is chosen by
-    these numbers. Their planes and hulls are made ready once.
+    The objects are those of the "val" split, or of "test" if there is no "val" split. The results decide only which
+    model is written to best/. Planes and hulls of the objects are prepared once.
 
     Args:
-        model: that is trained.
-        data: with the held-out objects.
-        config: of the training; `held_out` says how many objects.
+        model: the model that is trained.
+        data: the data set with the held-out objects.
+        config: the configuration of the training; `held_out` is the number of objects.
         adapt: makes the field of an object.
     """
 
@@ -61,15 +61,15 @@ class Validator:
         self._episodes: dict[str, Episode] = {}
 
     def prepare(self) -> None:
-        """Read the held-out objects and make them ready; ValueError for one that cannot be validated on.
+        """Read and prepare the held-out objects; ValueError for an object that cannot be used.
 
-        The first validation does so where nobody has.
+        Otherwise the first validation does so.
         """
         self._held_out()
 
     @torch.no_grad()
     def run(self) -> Validation | None:
-        """PSNR of the views and the diagnostics of the hypernetwork; None where there are no held-out objects."""
+        """Validate the model; None if there are no held-out objects."""
         model, episodes = self.model, self._held_out()
         if not episodes:
             return None
@@ -84,7 +84,7 @@ class Validator:
             diagnostics = None
             if model.hypernetwork is not None and len(episodes) > 1:
                 prepared = [each.prepared for each in episodes]
-                # stacked pictures are no measure of what an update alone loses
+                # the gap is that of the fields alone, so the PSNR of stacked pictures cannot be used
                 stacked = model.config.stacked or model.config.hull_share or model.config.gated
                 gap = swap_gap(model, prepared, queries, None if stacked else quality)
                 diagnostics = replace(diagnose(model, prepared), swap_gap=gap)

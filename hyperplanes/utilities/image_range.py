@@ -9,6 +9,7 @@ from hyperplanes.utilities.arguments import kind_of
 from hyperplanes.utilities.transforms import are_plain
 
 __all__ = ["check_image_range"]
+
 MOST = 1.5
 """Largest pixel value accepted as an image in [0, 1]; rendered values may overshoot slightly."""
 
@@ -17,12 +18,12 @@ def check_image_range(name: str, values: object) -> None:
     """Refuse pictures or masks that are not floating-point numbers in [0, 1].
 
     Args:
-        name: of the argument.
-        values: what should be a tensor.
+        name: the name of the argument, for the message.
+        values: the argument.
 
     Raises:
-        ValueError: anything else, such as values from 0 to 255 or NaN. Tensors under a transform of PyTorch, whose
-            values cannot be read, pass.
+        ValueError: not such a tensor, or values out of range, such as 0 to 255 or NaN. Tensors under a transform of
+            PyTorch pass, because their values cannot be read.
     """
     if not isinstance(values, Tensor) or not values.is_floating_point():
         found, hint = kind_of(values), "; torch.from_numpy(x).float() / 255 converts 8-bit pixels"

@@ -170,7 +170,7 @@ def test_a_fitted_gate_takes_the_picture_that_is_right(monkeypatch):
     with_nothing = fit_gate([nothing, *examples], steps=2).state_dict()
     assert all(torch.equal(one[name], with_nothing[name]) for name in one)
     for unusable in ([], [nothing]):
-        with pytest.raises(ValueError, match="examples: expected one of which a picture shows anything"):
+        with pytest.raises(ValueError, match="examples: expected at least one example with a pixel"):
             fit_gate(unusable)
 
 

@@ -114,3 +114,10 @@ def test_views_left_out_decide_and_what_was_found_is_kept(views, capsys, monkeyp
     assert said in (told := capsys.readouterr().out)
     assert f"kept in {tmp_path}" in told
     assert torch.equal(again.query.cameras.extrinsics, found.query.cameras.extrinsics)
+
+
+def test_too_few_support_views_to_compare_poses_are_refused_before_poses_are_refined(views, monkeypatch):
+    monkeypatch.setattr(pose_refinement, "refine_poses", None)
+    task = Task(views[:3], views[3:], "car")
+    with pytest.raises(ValueError, match="--refine-poses: expected at least 4 support views .*, got 3"):
+        command.refine_task(HyperPlanes.from_pretrained("cars-64"), task, Console())

@@ -70,8 +70,8 @@ def test_ctrl_c_is_how_a_page_ends_and_a_termination_says_so(number, code, viewe
     assert main(["view", "example-car", "--fit", "0"]) == code
     assert viewer.made[0].stopped
     errors = capfd.readouterr().err
-    assert "goes on where it can" not in errors
-    assert "--port: 8080 is taken" in errors  # the page has another
+    assert "resumes where possible" not in errors
+    assert "--port: 8080 is in use" in errors  # the page has another
     assert ("terminated; the page is closed" in errors) == (code == 143)
 
 

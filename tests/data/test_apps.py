@@ -206,7 +206,7 @@ def test_names_lead_to_the_photographs_which_nothing_is_written_beside(tmp_path,
     write(tmp_path)
     task = read_task(tmp_path)
     assert all((tmp_path / name).samefile(tmp_path / home / Path(name).name) for name in task.support.names)
-    with pytest.raises(ValueError, match=f"--out: expected a folder that no pictures .* got {tmp_path / home}, "):
+    with pytest.raises(ValueError, match=f"--out: expected a folder that no images .* got {tmp_path / home}, "):
         refuse_sources(tmp_path / home, tmp_path, task)
     refuse_sources(tmp_path / "made", tmp_path, task)
 

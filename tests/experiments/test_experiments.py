@@ -262,18 +262,18 @@ def test_a_table_of_packaged_models_on_given_data_says_so():
     outcome = outcome_of(packaged, 1, objects={}, given=["car"])
     assert report.what_differs(outcome)[:3] == [
         "Data: given data sets of cars. Paper: ShapeNet at 128x128, 25 and 25 views.",
-        "Judged by 2 objects a class. Paper: all test objects.",
+        "Evaluated on 2 objects a class. Paper: all test objects.",
         "Seeds: packaged models are evaluated once. Paper: not stated.",
     ]
-    assert "states otherwise" not in report.as_markdown(outcome, "")
+    assert "states another value" not in report.as_markdown(outcome, "")
 
 
 def test_of_how_many_objects_and_runs_the_paper_speaks():
     """Source of truth: its words; "two objects from the car and chair classes", and "averaged over 3 runs"."""
     names = "iterations", "target"
     found = {name: report.what_differs(outcome_of(EXPERIMENTS[name], 3, objects={})) for name in names}
-    judged = {name: [line for line in lines if line.startswith("Judged by")] for name, lines in found.items()}
-    assert judged == {"iterations": [], "target": ["Judged by 2 objects a class. Paper: all test objects."]}
+    judged = {name: [line for line in lines if line.startswith("Evaluated on")] for name, lines in found.items()}
+    assert judged == {"iterations": [], "target": ["Evaluated on 2 objects a class. Paper: all test objects."]}
     assert [line.rpartition(". ")[2] for line in found["iterations"] if line.startswith("Seeds")] == ["Paper: 3."]
 
 

@@ -37,7 +37,7 @@ def ended():
 
 def test_of_a_worker_that_is_killed_one_line_is_said(ended):
     _, error = ended
-    assert error.match("one was killed .*; give fewer --workers, and the same")
+    assert error.match("one was killed .*; run the same command again with fewer --workers")
 
 
 def test_ctrl_c_while_a_worker_starts_is_left_to_its_parent(ended):

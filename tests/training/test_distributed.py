@@ -61,7 +61,9 @@ def test_a_process_that_is_killed_ends_the_other_and_its_checkpoint_goes_on_in_o
     folder, done = joined
     assert done.returncode in (2, -9)  # by itself, or by Fabric, which kills whom it finds waiting
     if done.returncode == 2:
-        assert done.stderr.strip().endswith("another process of this training has ended; its own message says why")
+        assert done.stderr.strip().endswith(
+            "another process of this training has ended; see the message of that process"
+        )
     assert "shared by 2 processes" in done.stdout
     out = folder / "killed"
     assert read_json(out / "training.json")["step"] == 2
@@ -81,7 +83,7 @@ def test_a_stop_that_one_process_is_asked_for_ends_both_after_the_same_step(join
     folder, _ = joined
     first, second = (read_json(folder / f"told-{rank}.json") for rank in range(2))
     assert first["step"] == second["step"] == 2
-    assert first["stopped"] == "KeyboardInterrupt: step 2 is saved, the same command goes on from there"
+    assert first["stopped"] == "KeyboardInterrupt: step 2 is saved; run the same command again to resume from there"
     assert second["stopped"] == "none"
     assert read_json(folder / "stopped" / "training.json")["step"] == 2
 

@@ -743,7 +743,7 @@ def test_training_warns_once_when_every_object_gets_the_same_update(capsys):
     trainer = Trainer(model, Balls(test=2), with_(steps=2, evaluate_every=1))
     with Console().bar("training") as bar:
         follow(trainer, bar)
-    assert capsys.readouterr().err.count("the hypernetwork writes the same update for every object") == 1
+    assert capsys.readouterr().err.count("the hypernetwork predicts the same update for every object") == 1
 
 
 def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stays(tmp_path):
@@ -786,7 +786,7 @@ def test_a_signal_ends_a_training_after_its_step_with_a_checkpoint(tmp_path, num
 
     before = signal.getsignal(number)
     trainer = Signalled(small_model(), Balls(test=0), with_(steps=9, checkpoint_every=9), tmp_path)
-    with Console().bar("training") as bar, pytest.raises(error, match="step 2 is saved, the same command"):
+    with Console().bar("training") as bar, pytest.raises(error, match="step 2 is saved; run the same command"):
         follow(trainer, bar)
     assert json.loads((tmp_path / "training.json").read_text())["step"] == 2
     assert signal.getsignal(number) is before

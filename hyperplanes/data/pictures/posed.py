@@ -204,10 +204,10 @@ def posed(
     if has_alpha and (wrong := inverted(rgba[:, 3:]).nonzero()[:, 0].tolist()):
         which = f"masks of {len(wrong)} of {len(names)} images ({listed([names[index] for index in wrong])})"
         notes = (*notes, f"{which} seem to show the background; invert them, white is the object")
-    outside = np.abs(intrinsics[:, :2, 2] - [(width - 1) / 2, (height - 1) / 2]) > [width / 2, height / 2]
-    if outside.any():
-        which = listed([names[index] for index in outside.any(1).nonzero()[0]])
-        notes = (*notes, f"the principal point lies outside the image: {which}; check cx and cy unless these are crops")
+    offset = np.abs(intrinsics[:, :2, 2] - [(width - 1) / 2, (height - 1) / 2])
+    if outside := [name for name, (x, y) in zip(names, offset, strict=True) if x > width / 2 or y > height / 2]:
+        where = f"the principal point lies outside the image: {listed(outside)}"
+        notes = (*notes, f"{where}; check cx and cy unless these are crops")
     try:
         cameras = camera.pinhole(
             torch.from_numpy(intrinsics).float(), torch.from_numpy(camera_from_world).float(), height, width

@@ -1,1 +1,1 @@
-"""The demonstration: an experiment on procedural objects whose result is a page."""
+"""The demonstration: an experiment on procedural objects whose result is an HTML page."""

@@ -1,4 +1,4 @@
-"""The pages of the demonstration: what the packaged model makes of objects, and what was trained."""
+"""The pages of the demonstration: one on the packaged model, and one on the models that were trained."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ from hyperplanes.views import Task, Views
 __all__ = ["compile_kernels", "describe_count", "overview", "write_first_page", "write_report"]
 
 HERO_SCALE, SCALE = 2.5, 1.5
-"""Sides of turntables as multiples of the images': of the first object, which is shown large, and of the others."""
+"""Sides of turntables as multiples of the side of the images: for the first object, which is large, and the others."""
 
 GAP = 6
 
-TITLE = "New views of objects it has never seen"
+TITLE = "New views of held-out objects"
 
 
 def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores: Mapping[str, Score]) -> None:
-    """Write what the packaged model makes of objects that no training saw.
+    """Write a page with new views by the packaged model, of objects that it was not trained on.
 
     Args:
-        path: of the page.
-        runner: of `settings.packaged`, all of whose cells are evaluated.
-        settings: of the demonstration.
-        scores: by row, over all classes.
+        path: the file of the page.
+        runner: the runner of `settings.packaged`, after all its cells were evaluated.
+        settings: the settings of the demonstration.
+        scores: the scores by row, over all classes.
     """
     fewest, most = settings.first_counts[0], settings.first_counts[-1]
     best = f"views_{most}"
@@ -74,8 +74,9 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
     height, width = task.query.size
     page = Report(
         title=TITLE,
-        lead=f"The packaged model {PACKAGED!r} looks at posed images of an object, any number of them from anywhere, "
-        "and writes the weights of a field that can be looked at from anywhere. Nothing was trained for this page.",
+        lead=f"The packaged model {PACKAGED!r} reads posed images of an object, any number of them from any "
+        "viewpoints, and predicts the weights of a field, which is rendered from new viewpoints. Nothing was trained "
+        "for this page.",
         figures=[
             (f"{scores[best].mean('psnr'):.2f} dB", f"PSNR from {most} views, after one forward pass"),
             (f"{scores[f'views_{fewest}'].mean('psnr'):.2f} dB", f"from {fewest} views"),
@@ -106,23 +107,23 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
 def _round(model: HyperPlanes, support: Views, cameras: PinholeCamera) -> Pixels:
     """The frames of a turntable after one forward pass.
 
-    By the field: for so few small frames baking and fitting voxels takes longer than 36 frames of 160x160 by the field
-    (13 s of one core) and shows less (1.0 dB on the query views of a held-out car).
+    They are rendered from the field. For so few small frames, baking and fitting voxels takes longer than 36 frames of
+    160x160 from the field (13 s on one core), and the result is 1.0 dB lower on the query views of a held-out car.
     """
     return to_pixels(model.adapt(support).render(cameras).images)
 
 
 def compile_kernels(device: torch.device) -> None:
-    """Have everything compiled and loaded that the packaged model renders with, by one small view of an example."""
+    """Compile and load everything that rendering with the packaged model needs, by one small view of an example."""
     example = read_task(EXAMPLES / "example-car")
     model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(device)
-    model.config = replace(model.config, symmetric=False)  # looking for a symmetry takes longer and compiles no more
-    few = example.support[:FEWEST].resized(32)  # as many as have it stack
+    model.config = replace(model.config, symmetric=False)  # the search for symmetry takes time and compiles nothing
+    few = example.support[:FEWEST].resized(32)  # enough views for stacking
     model.adapt(few).render(resized(example.query[:1].cameras, 32, 32))
 
 
 def describe_count(row: str, most: int) -> str:
-    """A row of the first page in words."""
+    """The description of a row of the first page."""
     return f"nearest of {most} views, copied" if row == "nearest_view" else f"{row.removeprefix('views_')} views"
 
 
@@ -130,9 +131,9 @@ def write_report(folder: Path, runner: Runner, settings: DemoSettings) -> None:
     """Write metrics.json, report.html and overview.png.
 
     Args:
-        folder: of the demonstration.
-        runner: of `settings.table`, after fine-tuning.
-        settings: of the demonstration.
+        folder: the folder of the demonstration.
+        runner: the runner of `settings.table`, after fine-tuning.
+        settings: the settings of the demonstration.
     """
     scores = {cell.row: runner.score(settings.table, cell, settings.seed) for cell in settings.table.cells}
     write_json(folder / "metrics.json", {row: score.as_json() for row, score in scores.items()})
@@ -156,7 +157,7 @@ def write_report(folder: Path, runner: Runner, settings: DemoSettings) -> None:
 
 
 def _turntable(checkpoint: Path, settings: DemoSettings, name: str, side: int, runner: Runner) -> Pixels:
-    """The frames of the turntable of an object of the class that was trained on, `side` pixels a side."""
+    """The frames of the turntable of an object of the training class, with `side` x `side` pixels."""
     model = HyperPlanes.from_pretrained(checkpoint).to(runner.device)
     support = model.arrange(runner.data.tasks(settings.class_name).task(name).support)
     return _round(model, support, orbit_cameras(support, settings.frames, size=side))
@@ -171,7 +172,7 @@ def _exhibit(
     query: Sequence[int],
     around: Pixels,
 ) -> Exhibit:
-    """An object: its support views and those that are read, some query views as each cell showed them, and a round."""
+    """An object on the page: its support views, those that are read, some query views by each cell, and a turntable."""
     truth, names = to_pixels(task.query.images), [f"{Path(name).stem}.png" for name in task.query.names]
     files = {cell.row: runner.pictures(cell, task.name) for cell in cells}
     views = [
@@ -200,7 +201,7 @@ def _describe(
     scores: Mapping[str, Score],
     exhibits: Sequence[Exhibit],
 ) -> Report:
-    """The page's content in words and numbers."""
+    """The content of the page."""
     one_step = scores["hyperplanes"]
     diagnostics = Diagnostics.of_json(read_json(folder / "hyperplanes" / "diagnostics.json"))
     gap = one_step.mean("psnr") - scores["hyperplanes_swapped"].mean("psnr")
@@ -208,8 +209,8 @@ def _describe(
     given = ["--checkpoint", folder, "--views", "scene"]
     return Report(
         title=TITLE,
-        lead=f"A hypernetwork looks at a few of {shown} posed images of a {settings.class_name} and writes the weights "
-        "of a field that can be looked at from anywhere.",
+        lead=f"A hypernetwork reads a few of {shown} posed images of a {settings.class_name} and predicts the weights "
+        "of a field, which is rendered from new viewpoints.",
         figures=[
             (f"{one_step.mean('psnr'):.2f} dB", "PSNR on held-out objects after one forward pass"),
             (f"{one_step.mean('ssim'):.3f}", "SSIM of the same views"),
@@ -224,11 +225,11 @@ def _describe(
             method: sorted((float(steps), quality) for steps, quality in found.items())
             for method, found in read_json(folder / "tuning.json").items()
         },
-        diagnostics=f"Over held-out objects, {diagnostics}. In the table, an object's own update is worth {gap:.2f} dB "
-        "more than that of another object.",
+        diagnostics=f"Over held-out objects, {diagnostics}. In the table, PSNR with an object's own update is "
+        f"{gap:.2f} dB higher than with the update of another object.",
         facts=_how_it_was_made(settings, folder, runner),
         commands=[
-            ("this page again, or what is left of it after an interruption", settings.command(folder)),
+            ("this page, or the rest of it after an interruption", settings.command(folder)),
             (
                 "a turntable of your own posed images (a folder with transforms.json)",
                 command_line("hyperplanes", "render", given, "--out", "new-views", "--orbit", 48),
@@ -242,7 +243,7 @@ def _describe(
 
 
 def _how_it_was_made(settings: DemoSettings, folder: Path, runner: Runner) -> list[tuple[str, str]]:
-    """Data, training, machine and time, label and value."""
+    """Labels and values on the data, the training, the time and the machine."""
     where, trained = environment(), settings.objects - settings.held_out
     steps = read_json(folder / "hyperplanes" / "training.json")["step"]
     manifest = read_json(runner.data.folder(settings.class_name) / "manifest.json")
@@ -264,12 +265,12 @@ def _how_it_was_made(settings: DemoSettings, folder: Path, runner: Runner) -> li
 
 
 def overview(exhibits: Sequence[Exhibit], rounds: Sequence[Pixels], side: int) -> Pixels:
-    """One picture of it all: a row an object, on the left what was read, on the right new views around it.
+    """An overview in one picture: a row per object, with images that were read on the left and new views on the right.
 
     Args:
         exhibits: the objects.
         rounds: the frames of their turntables.
-        side: of every picture in it, in pixels.
+        side: the side of every picture in it, in pixels.
 
     Returns:
         Pixels (height, width, 3).

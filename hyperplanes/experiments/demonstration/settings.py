@@ -1,4 +1,4 @@
-"""The demonstration as experiments: what is trained and evaluated, and how large."""
+"""The demonstration as experiments: its trainings, its evaluations and its size."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from hyperplanes.utilities.shell import command_line
 __all__ = ["MODELS", "PACKAGED", "TUNED", "DemoSettings", "describe_row"]
 
 TUNED = ("hyperplanes", "scratch")
-"""Methods whose PSNR over fine-tuning steps is drawn."""
+"""Methods in the chart of PSNR over fine-tuning steps."""
 
 MODELS = ("hyperplanes", "point_multiplane")
-"""What is trained, each into a folder of its name."""
+"""The models that are trained, each in a folder of its name."""
 
 PACKAGED = "small"
-QUERY_VIEWS = 2  # of each object on its page
-MOST = 12  # objects on its page
+QUERY_VIEWS = 2  # of each object on the page of the packaged model
+MOST = 12  # objects on that page
 
 TINY = {
     "model.network.depth": 2,
     "model.network.width": 16,
-    "model.hypernetwork.views": 12,  # of the paper's 50: three of six
+    "model.hypernetwork.views": 12,  # scaled from the paper's 50 views to 12: three HyperPlanes
     "model.hypernetwork.code": 8,
     "model.hypernetwork.depth": 1,
     "model.hypernetwork.width": 16,
@@ -38,33 +38,33 @@ TINY = {
     "training.warmup": 0,
     "training.checkpoint_every": 10,
 }
-"""Networks so small that nothing is learnt."""
+"""Changes to networks that are too small to learn anything."""
 
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """How large the demonstration is.
+    """The settings of the demonstration.
 
     Attributes:
-        class_name: of the procedural objects.
-        objects: how many, the held-out ones included.
-        held_out: of them.
-        resolution: pixels a side.
-        views: an object, half support and half query.
-        preset: what is trained.
-        steps: of every training.
-        seed: of everything.
-        exhibits: objects shown in the report.
-        frames: of each turntable.
-        unseen_objects: of another class, which no model is trained on.
-        fine_tuned: numbers of fine-tuning steps of the rows of the table, a few and many.
-        tuning: numbers of fine-tuning steps in the chart of fine-tuning.
-        tuned_objects: held-out objects that it is drawn of.
-        first: classes of which the packaged model shows one object each, before anything is trained.
-        first_resolution: of their images.
-        first_counts: numbers of views that it is shown of each.
-        meshes: a folder of mesh files that it shows too.
-        tiny: networks so small that nothing is learnt: to see that everything runs.
+        class_name: the class of the procedural objects.
+        objects: the number of objects, including the held-out ones.
+        held_out: the number of held-out objects.
+        resolution: pixels along a side of the images.
+        views: views per object, half support and half query views.
+        preset: the preset that is trained.
+        steps: the steps of every training.
+        seed: the seed of the data, the trainings and the evaluation.
+        exhibits: the number of objects in the report.
+        frames: the frames of each turntable.
+        unseen_objects: the number of evaluated objects of another class, on which no model is trained.
+        fine_tuned: the numbers of fine-tuning steps in the rows of the table, a small one and a large one.
+        tuning: the numbers of fine-tuning steps in the chart of fine-tuning.
+        tuned_objects: the number of held-out objects in that chart.
+        first: classes of which the packaged model renders one object each, before anything is trained.
+        first_resolution: pixels along a side of their images.
+        first_counts: the numbers of support views that it is given of each object.
+        meshes: a folder of mesh files that it renders too.
+        tiny: whether networks are too small to learn anything, to check that everything runs.
     """
 
     class_name: str = "car"
@@ -89,42 +89,42 @@ class DemoSettings:
 
     @property
     def unseen_class(self) -> str:
-        """The class of the objects that no model is trained on."""
+        """The class of the objects on which no model is trained."""
         return "car" if self.class_name == "chair" else "chair"
 
     @property
     def first_frames(self) -> int:
-        """Of each turntable on the first page."""
+        """The number of frames of each turntable on the first page."""
         return max(1, self.frames // 2)
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """The rows of the table on the class that was trained on."""
+        """The methods that are evaluated on held-out objects of the training class."""
         few, many = self.fine_tuned
         tuned = (f"hyperplanes_{few}", f"hyperplanes_{many}", f"scratch_{many}")
         return ("nearest_view", "point_multiplane", "hyperplanes_swapped", "hyperplanes", *tuned)
 
     @property
     def rows(self) -> tuple[str, ...]:
-        """All rows of the table: `methods`, and METHOD:CLASS for those on the class that was never trained on."""
+        """All rows of the table: `methods`, and METHOD:CLASS for methods that are evaluated on the unseen class."""
         many = self.fine_tuned[1]
         unseen = ("nearest_view", "hyperplanes", f"hyperplanes_{many}", f"scratch_{many}")
         return (*self.methods, *(f"{method}:{self.unseen_class}" for method in unseen))
 
     @property
     def table(self) -> Experiment:
-        """Every method on held-out objects of the class that was trained on, and some on objects of the other."""
+        """Every method on held-out objects of the training class, and some methods on objects of the unseen class."""
         return self._experiment([self._cell(row, *row.split(":")) for row in self.rows], keep_pictures=True)
 
     @property
     def fine_tuning(self) -> Experiment:
-        """PSNR after several numbers of fine-tuning steps."""
+        """The experiment on PSNR after several numbers of fine-tuning steps."""
         rows = [row for method in TUNED for row in at_steps(method, self.tuning)]
         return self._experiment([self._cell(row, row) for row in rows], objects=self.tuned_objects)
 
     @property
     def packaged(self) -> Experiment:
-        """The packaged model on objects that no training saw: a row a number of views, a column a class."""
+        """The packaged model on objects that it was not trained on: a row per number of views, a column per class."""
         rows = {"nearest_view": self.first_counts[-1]} | {f"views_{count}": count for count in self.first_counts}
         cells = []
         for row, count in rows.items():
@@ -136,7 +136,7 @@ class DemoSettings:
         return self._experiment(cells, objects=MOST - len(self.first), keep_pictures=True)
 
     def _cell(self, row: str, method: str, on: str = "") -> Cell:
-        # the same field from random weights is that of either training: it waits for the one that ends first
+        # either training has the architecture for random weights; PointMultiPlaneNeRF ends first
         trained = Trained(self.class_name, "hyperplanes" if method.startswith("hyperplanes") else "point_multiplane")
         return Cell(row, "", trained, method, on or self.class_name, trainable="weights")
 
@@ -149,7 +149,7 @@ class DemoSettings:
 
     @property
     def scale(self) -> Scale:
-        """How large the trainings are, and the data sets of both classes."""
+        """The scale of the trainings and of the data sets of both classes."""
         unseen = {"objects": self.unseen_objects, "held_out": self.unseen_objects}
         return Scale(
             name="demonstration",
@@ -164,10 +164,10 @@ class DemoSettings:
         )
 
     def packaged_scale(self, out: Path) -> Scale:
-        """One object a class from cameras anywhere, and the mesh files.
+        """The scale for the packaged model: one object per class with random cameras, and the mesh files.
 
         Args:
-            out: the folder of the demonstration; what it holds is none of the mesh files.
+            out: the folder of the demonstration, whose files are not counted as mesh files.
         """
         drawn: dict[str, object] = {"rig": "random", "seed": self.seed, "views": self.views}
         data: dict[str, Mapping[str, object]] = dict.fromkeys(self.first, drawn)
@@ -183,10 +183,10 @@ class DemoSettings:
         )
 
     def command(self, out: Path) -> str:
-        """The command that makes, or goes on with, a demonstration of these settings.
+        """The command that makes, or resumes, a demonstration with these settings.
 
         Args:
-            out: its folder.
+            out: the folder of the demonstration.
         """
         usual = DemoSettings.quick_check() if self.tiny else DemoSettings()
         options = [] if self.class_name == usual.class_name else ["--class", self.class_name]
@@ -197,7 +197,7 @@ class DemoSettings:
 
     @classmethod
     def quick_check(cls, seed: int = 0) -> DemoSettings:
-        """A demonstration of seconds that shows nothing but that it runs."""
+        """Settings of a demonstration that takes seconds and only checks that everything runs."""
         return cls(
             objects=4,
             held_out=2,
@@ -219,6 +219,6 @@ class DemoSettings:
 
 
 def describe_row(row: str) -> str:
-    """A row of the table in words."""
+    """The description of a row of the table."""
     method, _, class_name = row.partition(":")
     return describe_method(method) + (f", on {class_name}s: a class never trained on" if class_name else "")

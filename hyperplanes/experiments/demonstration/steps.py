@@ -1,4 +1,4 @@
-"""The steps of the demonstration, in their order."""
+"""The steps of the demonstration."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ __all__ = ["Demonstration"]
 
 
 class Demonstration:
-    """Everything once, small: the packaged model, data, trainings, evaluations and two pages.
+    """The demonstration: the packaged model, data, trainings, evaluations and two pages.
 
     Args:
-        settings: how large.
-        out: the folder for everything.
-        make_runner: a `Runner` of a workspace and a scale.
-        begin: called before anything is made.
-        say: called with a line.
-        evaluating: a context with the title of a row, for as long as it is evaluated: what its scores are told to.
+        settings: the settings of the demonstration.
+        out: the folder for all results.
+        make_runner: makes a `Runner` from a workspace and a scale.
+        begin: called before each piece of work.
+        say: prints a line.
+        evaluating: makes, from the title of a row, a context for its evaluation, which yields a function that is called
+            with each score.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Demonstration:
         self.runner = make_runner(Workspace(out, places, begin), settings.scale)
 
     def steps(self) -> dict[str, Callable[[], object]]:
-        """What does each step, unless it was done before, by its name."""
+        """The functions of the steps by name, in their order. Each does only what was not done before."""
         table, seed = self.settings.table, self.settings.seed
         return {
             "packaged model": self.show_packaged,
@@ -62,7 +63,7 @@ class Demonstration:
         }
 
     def show_packaged(self) -> None:
-        """What needs no training, in first.html."""
+        """Evaluate the packaged model and write first.html."""
         settings, page = self.settings, self.out / "first.html"
         names = ("first", "first_resolution", "first_counts", "seed", "frames")
         meshes = "" if settings.meshes is None else self.packaged.data.name("meshes")
@@ -72,9 +73,9 @@ class Demonstration:
     def _show_packaged(self, page: Path) -> None:
         experiment, scores = self.settings.packaged, {}
         with ThreadPoolExecutor(1) as beside:
-            # while other processes render, kernels are compiled that were not yet
+            # compile kernels while other processes render the data
             ready = beside.submit(compile_kernels, self.packaged.device)
-            for name in sorted(experiment.classes, key=lambda name: name != "meshes"):  # they may be wrong input
+            for name in sorted(experiment.classes, key=lambda name: name != "meshes"):  # first, as they may be invalid
                 self.packaged.data.folder(name)
             ready.result()
         for row in experiment.rows:
@@ -86,14 +87,14 @@ class Demonstration:
         self.say(f"the first page: {page.resolve().as_uri()}")
 
     def evaluate(self, cell: Cell) -> None:
-        """A row of the table; workers, if any, go on with the next ones and the chart of fine-tuning."""
+        """Evaluate a row of the table; workers, if any, continue with the next rows and the chart of fine-tuning."""
         for experiment in (self.settings.table, self.settings.fine_tuning):
             self.runner.start(experiment, self.settings.seed)
         with self.evaluating(cell.row) as on_score:
             self.runner.score(self.settings.table, cell, self.settings.seed, on_score)
 
     def tune(self) -> None:
-        """PSNR over fine-tuning steps, in tuning.json by method and number of steps."""
+        """Evaluate PSNR over fine-tuning steps and write tuning.json, by method and number of steps."""
         path = self.out / "tuning.json"
         self.runner.workspace.make("fine-tuning", self._deciding, [path], lambda: self._tune(path))
 
@@ -106,7 +107,7 @@ class Demonstration:
         write_json(path, {m: {str(n): found[row] for n in steps for row in at_steps(m, [n])} for m in TUNED})
 
     def report(self) -> None:
-        """The page, its picture and metrics.json."""
+        """Write the page, its picture and metrics.json."""
         outputs = [self.out / name for name in ("metrics.json", "report.html", "overview.png")]
         shown = {"exhibits": self.settings.exhibits, "frames": self.settings.frames}
         work = partial(write_report, self.out, self.runner, self.settings)
@@ -114,7 +115,7 @@ class Demonstration:
 
     @property
     def _deciding(self) -> Mapping[str, object]:
-        """What decides the evaluations: data, trainings, and the numbers of fine-tuning steps."""
+        """The settings on which evaluations depend: data, trainings, and the numbers of fine-tuning steps."""
         settings, runner, table = self.settings, self.runner, self.settings.table
         return {
             "data": [runner.data.name(name) for name in table.classes],

@@ -1,4 +1,4 @@
-"""Line charts for the page: SVG by matplotlib, readable on a light and on a dark page."""
+"""Line charts for the page: SVG by matplotlib, readable in light and dark mode."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hyperplanes.utilities.plots import draw_lines, encode_figure, new_figure, s
 
 __all__ = ["line_chart"]
 
-INK = "#8a857c"  # of axes and words: between the page's two papers
+INK = "#8a857c"  # colour of axes and text, between the background colours of light and dark mode
 
 
 def line_chart(
@@ -26,12 +26,12 @@ def line_chart(
         series: points (step, value) by name; lines without points are left out.
         vertical: the name of the vertical axis.
         horizontal: the name of the horizontal axis.
-        logarithmic: the vertical axis.
-        counts: the horizontal axis is logarithmic from 1 on, with a tick and a dot at every point: for few, growing
-            numbers that begin at 0.
+        logarithmic: whether the vertical axis is logarithmic.
+        counts: whether the horizontal axis is logarithmic from 1 on, with a tick and a dot at every point; for a few
+            increasing numbers that begin at 0.
 
     Returns:
-        A picture of its own, or nothing where there is nothing to draw.
+        The data URI; empty if there are no points.
     """
     shown = {name: points for name, points in series.items() if points}
     if not shown:

@@ -1,4 +1,4 @@
-"""What a report shows, as plain values."""
+"""The content of a report, as dataclasses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Pixels = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class QueryView:
-    """One view that no method was shown.
+    """One query view, which was given to no method.
 
     Attributes:
-        truth: (height, width, 3).
-        predictions: by method, of the same size.
+        truth: the true image, (height, width, 3).
+        predictions: the pictures by method, of the same size.
     """
 
     truth: Pixels
@@ -31,12 +31,12 @@ class Exhibit:
     """One held-out object.
 
     Attributes:
-        name: of the object.
-        support: (view, height, width, 3), what the methods were shown.
-        read: which of them the hypernetwork reads.
+        name: the name of the object.
+        support: the support views, (view, height, width, 3).
+        read: the indices of the support views that the hypernetwork reads.
         views: some query views.
-        psnr: dB over all query views, by method.
-        turntable: an animated WebP of the prediction, or nothing.
+        psnr: PSNR in dB over all query views, by method.
+        turntable: an animated WebP file of the prediction, or empty.
     """
 
     name: str
@@ -48,23 +48,23 @@ class Exhibit:
 
     @property
     def order(self) -> list[int]:
-        """The support views as they are shown, those that the hypernetwork reads first."""
+        """The indices of the support views on the page: first those that the hypernetwork reads, then the others."""
         return [*self.read, *(index for index in range(len(self.support)) if index not in self.read)]
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table.
+    """A row of the table.
 
     Attributes:
-        method: its name.
-        about: what it is, in a few words.
-        psnr: dB, mean over objects.
-        deviation: dB, standard deviation over objects.
-        foreground: dB inside the true masks, mean over objects; None without masks.
-        ssim: mean over objects.
-        adapt: how long it took from images to a field, as text.
-        render: how long a view took, as text.
+        method: the name of the method.
+        about: a short description of it.
+        psnr: PSNR in dB, mean over objects.
+        deviation: standard deviation of PSNR over objects, in dB.
+        foreground: PSNR in dB inside the true masks, mean over objects; None without masks.
+        ssim: SSIM, mean over objects.
+        adapt: the time from images to a field, as text.
+        render: the time to render a view, as text.
     """
 
     method: str
@@ -79,21 +79,21 @@ class Row:
 
 @dataclass(frozen=True)
 class Report:
-    """All that the page says.
+    """The content of the page.
 
     Attributes:
-        title: its heading.
-        lead: one sentence under it.
-        figures: a few numbers worth reading first, each with what it is.
-        method: the one that is shown first.
+        title: the heading.
+        lead: the sentences below the heading.
+        figures: the most important numbers as text, each with a description.
+        method: the method that is selected at first.
         exhibits: held-out objects.
-        table: one row a method.
-        curves: by method, training entries with "step", "loss" and at times "psnr"; without any, nothing is said of
-            training and fine-tuning.
-        tuning: by method, PSNR in dB after numbers of fine-tuning steps.
-        diagnostics: what the updates of the hypernetwork have and have not in common, in words.
-        facts: how it was made, label and value.
-        commands: how to make it again, and what to try next.
+        table: one row per method.
+        curves: by method, the rows of the curve of its training, with "step", "loss" and sometimes "psnr". If empty,
+            the sections on training and fine-tuning are left out.
+        tuning: by method, pairs of a number of fine-tuning steps and PSNR in dB.
+        diagnostics: a description of how much the updates of the hypernetwork differ.
+        facts: labels and values on how the page was made.
+        commands: descriptions and commands, to reproduce the page and to try next.
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""The page: one HTML file with everything in it, no script, nothing fetched."""
+"""The page: one self-contained HTML file without scripts."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Points = Sequence[tuple[float, float]]
 
 
 def render_page(report: Report) -> str:
-    """The whole page as text.
+    """The HTML text of the page.
 
     Raises:
-        ValueError: no exhibit, or a first method that the exhibits do not show.
+        ValueError: no exhibit, or exhibits without pictures of the method that is selected at first.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -31,7 +31,7 @@ def render_page(report: Report) -> str:
     return environment.from_string(folder.joinpath("report.html").read_text(encoding="utf-8")).render(
         report=report,
         methods=methods,
-        best=max(row.psnr for row in methods),  # not of the rows on other objects
+        best=max(row.psnr for row in methods),  # without the rows on other objects
         charts=_charts(report),
         style=folder.joinpath("style.css").read_text(encoding="utf-8"),
         gradient=gradient(),
@@ -40,7 +40,7 @@ def render_page(report: Report) -> str:
 
 
 def _charts(report: Report) -> Mapping[str, str]:
-    """The charts as data URIs; empty where nothing was recorded."""
+    """The charts as data URIs; empty strings for charts without points."""
     quality = {
         name: [(entry["step"], entry["psnr"]) for entry in curve if "psnr" in entry]
         for name, curve in report.curves.items()

@@ -1,4 +1,4 @@
-"""Pictures for a page: inlined files, and errors as colours."""
+"""Pictures for a page: files as data URIs, and error maps."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from hyperplanes.utilities.encoding import encode_png
 __all__ = ["ERROR_SCALE", "colour_scale", "error_map", "gradient", "inline", "inline_png"]
 
 ERROR_SCALE = 0.25
-"""The difference that is drawn in the last colour."""
+"""The difference that has the last colour of the scale."""
 
 _ANCHORS = ("#ffffff", "#fde8c8", "#f9bd74", "#ec7b3a", "#c5402d", "#7f1833", "#2c0b28")
-"""White, where nothing is wrong, to dark, even in lightness."""
+"""Colours from white, for no error, to dark, in equal steps of lightness."""
 
 
 def colour_scale(values: npt.NDArray[np.floating]) -> Pixels:
-    """Colours (..., 3) of values in [0, 1], interpolated between anchors; what lies outside is clamped.
+    """The colours (..., 3) of values, interpolated between anchors; values outside [0, 1] are clamped.
 
     >>> colour_scale(np.array([0.0, 1.0])).tolist()
     [[255, 255, 255], [44, 11, 40]]
@@ -31,7 +31,7 @@ def colour_scale(values: npt.NDArray[np.floating]) -> Pixels:
 
 
 def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
-    """The absolute difference, mean over the channels, on the colour scale up to ERROR_SCALE.
+    """The absolute difference, averaged over the channels, as colours of the scale from 0 to ERROR_SCALE.
 
     Raises:
         ValueError: pictures of different sizes.

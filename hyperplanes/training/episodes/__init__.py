@@ -1,4 +1,4 @@
-"""The objects of the steps of a training: which are drawn, how they are made ready, and how they are augmented."""
+"""The objects of the steps of a training: how they are drawn, prepared and augmented."""
 
 from hyperplanes.training.episodes.episode import Episode, prepare_episode
 from hyperplanes.training.episodes.loader import Batch, Draw, EpisodeLoader

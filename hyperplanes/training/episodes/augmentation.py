@@ -1,4 +1,4 @@
-"""What is changed at random in training objects: how they stand, which planes show them, what is behind them."""
+"""Random augmentation of training objects: rotations, plane dropout and background colours."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def draw_rotation(share: float, generator: torch.Generator) -> Rotation:
     """A random rotation.
 
     Args:
-        share: probability that there is one, by any angle.
-        generator: of the draws, which are as many whatever they decide.
+        share: probability of a rotation by a uniformly random angle; otherwise the rotation is the identity.
+        generator: the generator of two random numbers, which are always drawn.
     """
     chance, angle = torch.rand(2, generator=generator).tolist()
     return Rotation(2 * math.pi * angle) if chance < share else Rotation()
 
 
 def drop_planes(prepared: SupportContext, chance: float, generator: torch.Generator) -> SupportContext:
-    """The object without some of its planes, each with that chance; with 0, nothing is drawn."""
+    """The object with each plane masked with probability `chance`; if that is 0, nothing is drawn."""
     if not chance:
         return prepared
     hidden = torch.rand(len(prepared.views), generator=generator) < chance
@@ -41,22 +41,24 @@ def over_random_colour(
     """Prediction and truth composited over one random colour.
 
     Args:
-        rendered: the prediction.
-        truth: over white.
-        opacity: of the truth.
-        generator: of the colour.
+        rendered: the prediction, over white.
+        truth: the true colours, over white.
+        opacity: the true opacities.
+        generator: the generator of the colour.
     """
     colour = torch.rand(3, generator=generator).to(truth)
     return rendered.over(colour), truth + (1 - opacity) * (colour - 1)
 
 
 def rotated_volume(volume: Float[Tensor, "4 x y z"], rotation: Rotation) -> Float[Tensor, "4 x y z"]:
-    """The first channels of a volume (`geometry.volume.volume_of`) of a rotated object.
+    """The first channels of the volume (`geometry.volume.volume_of`) of a rotated object.
+
+    The volume is resampled, so the result is smoother than the volume of the rotated views.
 
     Args:
-        volume: the share of every cell that is occupied, and its mean colour in [-1, 1], which is weighted by it. It is
-            resampled, so that the result is smoother than the volume of the rotated views.
-        rotation: of the object.
+        volume: the share of each cell that is occupied, and its mean colour in [-1, 1]. Colours are weighted by the
+            shares when they are resampled.
+        rotation: the rotation of the object.
     """
     if not rotation.angle:
         return volume

@@ -1,4 +1,4 @@
-"""Which objects a step is of, and what everything random about each is drawn from."""
+"""Random draws of a training: the objects of each step, and the generators of everything random about them."""
 
 from __future__ import annotations
 
@@ -22,44 +22,50 @@ __all__ = [
     "step_generator",
 ]
 
-EPISODES, ORDERS = 1, 2  # set the streams of these apart from those of rays
+EPISODES, ORDERS = 1, 2  # parts of the seeds of these streams, which keep them different from those of rays
 
 OBJECTS_A_STREAM = 4
-"""Objects of a step that share the episodes at hand; further ones have others."""
+"""Objects of a step that draw from one stream of episodes; further objects draw from other streams."""
 
 
 def step_generator(seed: int, step: int) -> torch.Generator:
-    """What the objects of a step (the first is 0) are drawn from."""
+    """The generator of the objects of a step; steps begin at 0."""
     return torch.Generator().manual_seed(seed * 1_000_003 + step)
 
 
 def object_generator(seed: int, step: int, place: int) -> torch.Generator:
-    """What rays and samples of the object at a place of a step are drawn from, whoever else is in it."""
+    """The generator of rays and samples of one object of a step; it does not depend on the other objects.
+
+    Args:
+        seed: the seed of the training.
+        step: the step, from 0.
+        place: the index of the object in the step.
+    """
     return _generator(seed, step, place)
 
 
 def episode_generator(seed: int, number: int) -> torch.Generator:
-    """What the views of an episode are drawn from; numbers begin at 0."""
+    """The generator of the views of an episode; numbers begin at 0."""
     return _generator(seed, number, 0, EPISODES)
 
 
 def draw(names: Sequence[str], count: int, generator: torch.Generator) -> list[str]:
-    """Objects of a step, different ones while there are enough."""
+    """The objects of a step. An object occurs twice only if there are fewer objects than `count`."""
     if count == 1:
         return [names[int(torch.randint(len(names), (), generator=generator))]]
     return [names[index] for index in _places(len(names), count, generator)]
 
 
 def draw_balanced(classes: Mapping[str, Sequence[str]], count: int, generator: torch.Generator) -> list[str]:
-    """Objects of a step in which the numbers of objects of any two classes differ by at most one.
+    """The objects of a step, such that the numbers of objects of any two classes differ by at most one.
 
     Args:
-        classes: the objects of each.
-        count: how many.
-        generator: of the draws.
+        classes: the objects of each class.
+        count: the number of objects to draw.
+        generator: the generator of the draws.
 
     Returns:
-        Names, in an order of classes that is drawn too; different ones while a class has enough.
+        Names, in a random order of classes. A name occurs twice only if its class has too few objects.
     """
     known = sorted(classes)
     order = [known[index] for index in _places(len(known), count, generator)]
@@ -68,19 +74,19 @@ def draw_balanced(classes: Mapping[str, Sequence[str]], count: int, generator: t
 
 
 def draw_episodes(count: int, at_hand: int, step: int, generator: torch.Generator) -> list[int]:
-    """Numbers of the episodes of a step, different ones.
+    """The numbers of the episodes of a step, all different.
 
-    Every four objects of a step draw from a stream of episodes of their own, so that an episode is drawn as often
-    however many objects a step has, and processes that share the objects of a step share the streams.
+    Every four objects of a step draw from their own stream of episodes. So an episode is drawn equally often whatever
+    the number of objects of a step, and processes that share the objects of a step also share the streams.
 
     Args:
-        count: how many.
-        at_hand: episodes of each stream that there are at a time; every step begins one more.
+        count: the number of episodes to draw.
+        at_hand: the number of episodes of each stream to draw from; each step replaces the oldest one by a new one.
         step: steps done before.
-        generator: of the draws.
+        generator: the generator of the draws.
 
     Returns:
-        Those of the first stream, then those of the next.
+        The episodes of the first stream, then those of the next.
     """
     streams = max(1, count // OBJECTS_A_STREAM)
     drawn: list[int] = []
@@ -92,12 +98,12 @@ def draw_episodes(count: int, at_hand: int, step: int, generator: torch.Generato
 
 
 def episode_object(classes: Mapping[str, Sequence[str]], number: int, seed: int) -> str:
-    """The object of an episode: classes in turn, and within each all objects once before any comes again.
+    """The object of an episode. Classes alternate, and in each class all objects occur once before any is repeated.
 
     Args:
-        classes: the objects of each.
-        number: of the episode, from 0.
-        seed: of the training.
+        classes: the objects of each class.
+        number: the number of the episode, from 0.
+        seed: the seed of the training.
     """
     turn, place = divmod(number, len(classes))
     chosen = sorted(classes)[place]
@@ -107,14 +113,14 @@ def episode_object(classes: Mapping[str, Sequence[str]], number: int, seed: int)
 
 
 def points_in(bounds: Sphere, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
-    """Random points, evenly in the volume of a sphere, on the CPU."""
+    """Uniformly random points in a sphere, on the CPU."""
     unit = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     unit = unit * torch.rand(count, 1, generator=generator) ** (1 / 3)
     return unit * bounds.radius + torch.tensor(bounds.centre)
 
 
 def _generator(*numbers: int) -> torch.Generator:
-    """A generator whose stream has nothing to do with that of other numbers, or of another count of them."""
+    """A generator whose stream is independent of those of other numbers and of another count of numbers."""
     state = np.random.SeedSequence(numbers).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(state[0]))
 

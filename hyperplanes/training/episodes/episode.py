@@ -1,4 +1,4 @@
-"""One object as a step of training needs it: planes, hull and query views."""
+"""One object prepared for training steps: planes, visual hull and query views."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from hyperplanes.views import Task, Views, join_views
 
 __all__ = ["Episode", "prepare_episode", "prepare_subset", "volume_of_all_views"]
 
-QUERIES = 4  # views that rays are drawn from, of those that an episode does not show
+QUERIES = 4  # query views of an episode with random support views
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One object, where the model is.
+    """One object, on the device of the model.
 
     Attributes:
-        prepared: its support side.
-        query: the views that the loss is taken on.
-        live: flat indices of the query pixels that look into the hull; None where all are drawn from.
-        target_volume: of `volume_of_all_views`, where the training has a volume loss.
+        prepared: the support views and what is computed from them.
+        query: the views from which the rays of the loss are drawn.
+        live: flat indices of the query pixels whose rays may meet the hull; None if rays are drawn from all pixels.
+        target_volume: the result of `volume_of_all_views`, if the training has a volume loss.
     """
 
     prepared: SupportContext
@@ -40,14 +40,14 @@ class Episode:
 
     @cached_property
     def support_live(self) -> Int[Tensor, " pixel"] | None:
-        """Flat indices of the pixels of the planes that look into the hull; None where all are drawn from."""
+        """Flat indices of the pixels of the planes whose rays may meet the hull; None if rays are drawn from all."""
         if self.live is None:
             return None
         return live_pixels(self.prepared.occupancy, self.prepared.views)
 
     @property
     def nbytes(self) -> int:
-        """Memory of images, masks, hull, volumes and indices, and of the copy that lookups make of the planes."""
+        """The bytes of images, masks, hull, volumes and indices, and of the copy of the planes that lookups make."""
         planes = self.prepared.views
         own = (
             planes.nbytes * (2 if isinstance(self.prepared.planes, VisibilityPlanes) else 1)
@@ -60,15 +60,15 @@ class Episode:
 
 
 def prepare_episode(model: HyperPlanes, task: Task, *, carved: bool = True) -> Episode:
-    """An object made ready for steps of training.
+    """An object prepared for training steps.
 
     Args:
-        model: whose planes and device count.
+        model: the model, which determines the planes and the device.
         task: the object.
-        carved: without, no hull is made; `Hierarchical` sampling never reads one.
+        carved: whether to carve the visual hull; `Hierarchical` sampling does not need it.
 
     Returns:
-        All of it that does not depend on weights.
+        Everything that does not depend on weights.
     """
     with prefix_errors(task.name):
         prepared = model.prepare(task.support, carved=carved)
@@ -86,17 +86,17 @@ def prepare_subset(
     generator: torch.Generator,
     target_volume: Float[Tensor, "4 x y z"] | None = None,
 ) -> Episode:
-    """An object shown by a random number of random views, some others of which are the query views.
+    """An object with a random number of random support views, and up to QUERIES of its other views as query views.
 
     Args:
-        model: takes any number of views in any order.
-        task: the object; which of its views are support and which query does not matter.
-        counts: of the views that are shown, each as likely as the others; one is left for the query.
-        generator: of the choice.
-        target_volume: of `volume_of_all_views`.
+        model: a model for any number of views in any order.
+        task: the object; its division into support and query views does not matter.
+        counts: numbers of support views, each with equal probability; at least one view is left as a query view.
+        generator: the generator of the choice.
+        target_volume: the result of `volume_of_all_views`.
 
     Returns:
-        The object, made ready for steps of training.
+        The object, prepared for training steps.
     """
     views = join_views(task.support, task.query)
     count = counts[int(torch.randint(len(counts), (), generator=generator))]
@@ -107,10 +107,10 @@ def prepare_subset(
 
 
 def volume_of_all_views(model: HyperPlanes, task: Task) -> Float[Tensor, "4 x y z"]:
-    """What all views of an object together show of each cell: the share that the hull occupies, and the mean colour.
+    """For each cell of the volume, the share in the hull of all views, and the mean colour of all views.
 
     Returns:
-        The first channels of `volume_of`, in half precision: they are kept for every object of a training.
+        The first channels of `volume_of`, in half precision, because they are kept for every object of a training.
     """
     with prefix_errors(task.name):
         volume = model.prepare(join_views(task.support, task.query)).volume

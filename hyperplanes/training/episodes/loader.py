@@ -1,4 +1,4 @@
-"""The objects of each step: drawn from the seed and the number of the step, and made ready by a thread beforehand."""
+"""Draws the objects of each step from the seed and the number of the step; a thread prepares them in advance."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class Draw:
     """One object of a step.
 
     Attributes:
-        name: of the object, with the number of the episode where views are drawn too.
-        episode: the object, ready.
-        generator: of its rays and samples, the same whoever else is in the step.
+        name: the name of the object; if views are drawn at random, with the number of the episode.
+        episode: the prepared object.
+        generator: the generator of its rays and samples, which does not depend on the other objects of the step.
     """
 
     name: str
@@ -55,9 +55,9 @@ class Batch:
     """The objects of a step.
 
     Attributes:
-        names: of all of them, whichever process has them.
-        rendered: this process's objects, of which rays are rendered.
-        reference: this process's objects of which only the HyperPlanes are read.
+        names: the names of all objects of the step, in all processes.
+        rendered: the objects of this process whose rays are rendered.
+        reference: the objects of this process of which only the HyperPlanes are read.
     """
 
     names: Sequence[str]
@@ -66,13 +66,13 @@ class Batch:
 
 
 class EpisodeLoader:
-    """Draws the objects of every step from (seed, step), so that a training that is resumed draws the same.
+    """Draws the objects of every step from (seed, step), so that a resumed training draws the same objects.
 
     Args:
-        model: that is trained; its planes and its device count.
-        data: with the training objects.
-        config: of the training.
-        processes: that share the objects of each step.
+        model: the model that is trained; it determines the planes and the device.
+        data: the data set with the training objects.
+        config: the configuration of the training.
+        processes: the processes that share the objects of each step.
 
     Raises:
         ValueError: no object to train on.
@@ -87,33 +87,33 @@ class EpisodeLoader:
         self.cache: LRUCache[Episode] = LRUCache(config.memory, keep_last=True)
         self._prefetcher = Prefetcher(self._load, self.cache)
         self._volumes: LRUCache[Tensor] = LRUCache(config.memory // 2)
-        self._lock = threading.Lock()  # of `_volumes`, which the prefetching thread uses too
-        # PyTorch loads its linear algebra for GPUs when it is first asked for, which fails in two threads at a time
+        self._lock = threading.Lock()  # for `_volumes`, which the prefetching thread uses too
+        # PyTorch loads its linear algebra for GPUs on first use, which fails if two threads do so at the same time
         torch.linalg.det(torch.eye(3, device=model.rig.device))
 
     def batch(self, step: int) -> Batch:
-        """The objects of a step (the first is 0), ready; one that is asked for the first time is made ready here."""
+        """The prepared objects of a step; steps begin at 0. Objects that no thread has prepared are prepared here."""
         names = self.names_of(step)
         draws = [Draw(name, self.get(name), self._generator(step, place)) for place, name in self._own(names)]
         count = self.config.tasks // self.processes.count
         return Batch(names, draws[:count], draws[count:])
 
     def expect(self, step: int) -> None:
-        """Have a thread begin with the objects of the steps after this one, as many as `prefetch` says."""
+        """Let a thread prepare the objects of the next `prefetch` steps after this one."""
         ahead = range(step + 1, min(step + 1 + self.config.prefetch, self.config.steps))
         self._prefetcher.expect(name for each in ahead for _, name in self._own(self.names_of(each)))
 
     def get(self, name: str) -> Episode:
-        """An object, ready."""
+        """A prepared object."""
         return self._prefetcher.get(name)
 
     def close(self) -> None:
-        """Let the thread end."""
+        """End the thread."""
         self._prefetcher.close()
 
     @cached_property
     def fingerprint(self) -> dict[str, Any]:
-        """What tells the objects that are trained on from others: names, and pictures and calibration of the first."""
+        """Identifies the training objects: a hash of their names, and the images and calibration of the first one."""
         support = self.data.task(self.names[0]).support
         first = (support.images * 255).round().to(torch.uint8).cpu().contiguous()
         matrix = camera.intrinsics(support.cameras)[0].double().cpu()
@@ -125,7 +125,7 @@ class EpisodeLoader:
         }
 
     def names_of(self, step: int) -> list[str]:
-        """The objects of a step (the first is 0), different while there are enough: to render, then for reference."""
+        """The objects of a step, those to render first, then those for reference; steps begin at 0."""
         config, generator = self.config, step_generator(self.config.seed, step)
         count = config.tasks + reference_objects(self.model.config, config)
         if config.views:
@@ -138,7 +138,7 @@ class EpisodeLoader:
         return object_generator(self.config.seed, step, place)
 
     def _numbered(self, number: int) -> str:
-        """The name of an episode: that of its object, and its number."""
+        """The name of an episode: the name of its object, #, and its number."""
         return f"{episode_object(self.classes or {'': self.names}, number, self.config.seed)}#{number}"
 
     def _own(self, names: Sequence[str]) -> Iterable[tuple[int, str]]:
@@ -147,23 +147,23 @@ class EpisodeLoader:
         return [*self.processes.share(places[:tasks]), *self.processes.share(places[tasks:])]
 
     def _load(self, name: str) -> Episode:
-        """Read an object and make it ready: as it is, or as the episode of this number shows it."""
+        """Read and prepare an object, or an episode with random views of it."""
         if not self.config.views:
             return prepare_episode(self.model, self.data.task(name), carved=reads_hull(self.model, self.config))
         name, _, number = name.rpartition("#")
         generator = episode_generator(self.config.seed, int(number))
         task, config = self.data.task(name), self.config
         target = self._target_volume(task)
-        # turn the object about the vertical axis, views and volume alike
+        # rotate the views and the volume of the object about the vertical axis
         if config.rotations:
             rotation = draw_rotation(config.rotations, generator)
             task = Task(rotation.views(task.support), rotation.views(task.query), task.name)
             target = None if target is None else rotated_volume(target, rotation)
-        # show some of its views, and keep others for rays
+        # draw support and query views
         return prepare_subset(self.model, task, config.views, generator, target)
 
     def _target_volume(self, task: Task) -> Tensor | None:
-        """What all views of an object show, where there is a volume loss; made once while there is room."""
+        """The volume of all views of an object, if there is a volume loss; kept in an LRU cache."""
         if not self.config.volume_loss:
             return None
         with self._lock:
@@ -176,7 +176,7 @@ class EpisodeLoader:
 
 
 def training_names(data: Tasks) -> list[str]:
-    """The objects to train on; ValueError where there are none."""
+    """The names of the objects to train on; ValueError if there are none."""
     names = sorted(data.names("train"))
     if not names:
         raise ValueError("data: expected at least one training object, got none")
@@ -184,10 +184,10 @@ def training_names(data: Tasks) -> list[str]:
 
 
 def reference_objects(model: ModelConfig, config: TrainingConfig) -> int:
-    """How many objects of a step only have their HyperPlanes read; none where no network reads HyperPlanes."""
+    """The number of objects of a step of which only the HyperPlanes are read; 0 if no network reads HyperPlanes."""
     return config.reference_objects if (model.hypernetwork or model.autoencoder) is not None else 0
 
 
 def reads_hull(model: HyperPlanes, config: TrainingConfig) -> bool:
-    """Whether a sample or the field depends on the hull; the paper's protocol samples without one."""
+    """Whether sampling, the field or a loss depends on the hull; the paper's protocol does not use it."""
     return model.target.permutation_invariant or model.config.sampling.needs_occupancy or config.empty_points > 0

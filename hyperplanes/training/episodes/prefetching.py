@@ -1,4 +1,4 @@
-"""Objects made ready by a thread while steps of training are taken, so that no step waits for a file."""
+"""A thread that prepares objects during training steps, so that no step waits for a file."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Value = TypeVar("Value")
 
 
 class Prefetcher(Generic[Value]):
-    """Values by name from a cache, from a thread that was told what is coming, or made at once.
+    """Values by name: from a cache, from a thread that makes expected values in advance, or made at once.
 
-    Only the calling thread changes the cache. An error of the thread is raised where its value is asked for.
+    Only the calling thread changes the cache. An error in the thread is raised by `get` of the same name.
 
     Args:
-        load: makes a value; called in one thread beside the calling one, so both may run it at a time.
-        cache: keeps values.
+        load: makes a value. It may run in the thread and in the calling thread at the same time.
+        cache: keeps the values.
     """
 
     def __init__(self, load: Callable[[str], Value], cache: LRUCache[Value]) -> None:  # pyright: ignore[reportInvalidTypeArguments]
@@ -29,7 +29,7 @@ class Prefetcher(Generic[Value]):
         self._thread: ThreadPoolExecutor | None = None
 
     def expect(self, names: Iterable[str]) -> None:
-        """Begin with what will be asked for next, and hold what is kept of it until then."""
+        """Start making the values that are needed next; those in the cache are held until `get` returns them."""
         for name in names:
             if name in self._coming:
                 continue
@@ -43,7 +43,7 @@ class Prefetcher(Generic[Value]):
             self._coming[name] = self._thread.submit(self._load, name)
 
     def get(self, name: str) -> Value:
-        """The value of that name; it is kept for later where there is room."""
+        """The value of a name, which is added to the cache."""
         value = self._cache.get(name)
         coming = self._coming.pop(name, None)
         if value is None:
@@ -52,7 +52,7 @@ class Prefetcher(Generic[Value]):
         return value
 
     def close(self) -> None:
-        """Let the thread end after what it is doing; what it had not begun is forgotten."""
+        """End the thread after its current value; values that it has not begun are cancelled."""
         if self._thread is not None:
             self._thread.shutdown(cancel_futures=True)
         self._thread = None

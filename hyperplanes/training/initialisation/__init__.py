@@ -1,4 +1,4 @@
-"""Training of learned initialisations: Reptile and MAML on objects, and random weights matched to a learned one."""
+"""Training of learned initialisations: Reptile and MAML on objects, and random weights matched to Reptile's."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ __all__ = ["MAML", "Matching", "Reptile", "initialisation_objective", "initialis
 def initialisation_objective(
     model: HyperPlanes, config: TrainingConfig, reference: HyperPlanes | None = None
 ) -> Objective:
-    """How a model with an `InitialisationConfig` is trained.
+    """The objective of the training of a model with an `InitialisationConfig`.
 
     Args:
-        model: that is trained.
-        config: of the training.
+        model: the model that is trained.
+        config: the configuration of the training.
         reference: for "mv_matched", the initialisation to match.
 
     Raises:
@@ -41,5 +41,8 @@ def initialisation_objective(
 def initialisation_trainer(
     model: HyperPlanes, data: Tasks, config: TrainingConfig, folder: Path | None, reference: HyperPlanes | None = None
 ) -> Trainer:
-    """The training of a model with an `InitialisationConfig`; arguments as in `Trainer` and in the objective's."""
+    """The trainer of a model with an `InitialisationConfig`.
+
+    The arguments are those of `Trainer` and of `initialisation_objective`.
+    """
     return Trainer(model, data, config, folder, initialisation_objective(model, config, reference))

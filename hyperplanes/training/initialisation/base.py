@@ -1,4 +1,4 @@
-"""What the objectives of learned initialisations have in common."""
+"""The base class of the objectives of learned initialisations."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ __all__ = ["InitialisationObjective", "draw_rays", "draw_seed"]
 
 
 class InitialisationObjective(Objective):
-    """Weights that are validated after gradient steps on an object, as many as in training.
+    """An objective whose weights are validated after gradient steps on an object, as many as in training.
 
     Args:
-        model: without a hypernetwork; trained in place.
-        config: of the training.
+        model: a model without a hypernetwork, which is trained in place.
+        config: the configuration of the training.
     """
 
     @property
@@ -34,24 +34,24 @@ class InitialisationObjective(Objective):
         return self.model.config.initialisation
 
     def adapt(self, prepared: SupportContext) -> AdaptedField:
-        """The field of a held-out object, after the steps of training, whether they lower its error or not."""
+        """The field of a held-out object after as many gradient steps as in training, even if they make no progress."""
         settings = replace(self.initialisation.descent(self.config.rays), seed=self.config.seed)
         return made_anyway(lambda: fine_tune_to(self.model, prepared, self.initialisation.inner_steps, settings))
 
     def set_gradients(self, gradient: Parameters) -> None:
-        """Give the optimisers a gradient that no backward pass has made."""
+        """Set the gradients for the optimisers, since no backward pass does so."""
         for name, value in self.model.networks.named_parameters():
             value.grad = gradient[name]
 
 
 def draw_seed(generator: torch.Generator) -> int:
-    """A seed for what has a generator of its own."""
+    """A random seed for another generator."""
     return int(torch.randint(2**31, (), generator=generator))
 
 
 def draw_rays(
     episode: Episode, field: AdaptedField, count: int, generator: torch.Generator, *, of_support: bool = False
 ) -> tuple[Rays, Tensor]:
-    """Rays of the query views or of the planes of an object, and their colours."""
+    """Random rays of the query views of an object, or of its planes, and their true colours."""
     views, live = (episode.prepared.views, episode.support_live) if of_support else (episode.query, episode.live)
     return views.sample_rays(count, generator=generator, among=live, near_far=field.sampling.near_far)

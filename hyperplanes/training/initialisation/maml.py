@@ -1,4 +1,4 @@
-"""MAML: an initialisation from which gradient steps on an object go far, by the gradient through them."""
+"""MAML: an initialisation that minimises the loss after gradient steps, by the gradient through these steps."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ __all__ = ["MAML"]
 
 
 class MAML(InitialisationObjective):
-    """The loss of query rays after gradient steps on support rays, and its gradient through them (Finn et al. 2017).
+    """The loss of query rays after gradient steps on support rays, differentiated through them (Finn et al. 2017).
 
     Raises:
-        ValueError: a field of any order, which would learn to copy the views that support rays come from.
+        ValueError: a permutation-invariant field, which would learn to copy the views of the support rays.
     """
 
     def __init__(self, model: HyperPlanes, config: TrainingConfig) -> None:
         if model.target.permutation_invariant:
-            raise ValueError(f"maml: expected a field that knows views by their places, got {model.config.target}")
+            raise ValueError(f"maml: expected a field with a fixed order of views, got {model.config.target}")
         super().__init__(model, config)
 
     @property
     def rays_per_step(self) -> int:
-        """Rays of all inner steps and of the outer loss on all objects."""
+        """The number of rays of all inner steps and of the outer loss, over all objects."""
         return super().rays_per_step * (self.initialisation.inner_steps + 1)
 
     def gradients(self, batch: Batch) -> float:
-        """MAML's gradient, averaged over the objects."""
+        """Set the gradient of MAML, averaged over the objects; returns the mean outer loss."""
         total, mean, count = 0.0, Parameters(), len(batch.rendered)
         initialisation, theta = self.initialisation, self.model.theta.detach()
         first_order, sampling = initialisation.method == "maml_first_order", self.model.config.sampling
         if not first_order and isinstance(sampling, RayMarching):
-            sampling = replace(sampling, stop=0.0)  # no estimate of gradients: its second derivatives are wrong
+            sampling = replace(sampling, stop=0.0)  # otherwise gradients are estimates with wrong second derivatives
         for draw in batch.rendered:
             episode, generator, rays = draw.episode, draw.generator, self.config.rays
             field = self.model.field(episode.prepared, theta)
-            # support rays for every inner step, query rays for the outer loss
+            # draw support rays for every inner step, and query rays for the outer loss
             drawn = [
                 draw_rays(episode, field, rays, generator, of_support=True) for _ in range(initialisation.inner_steps)
             ]

@@ -1,4 +1,4 @@
-"""Random weights matched to a learned initialisation: the same function in other weights (Tancik et al. 2021)."""
+"""Random weights matched to a learned initialisation: the same function with other weights (Tancik et al. 2021)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["Matching"]
 
 
 class Matching(InitialisationObjective):
-    """Random weights trained to give the colours and opacities of a learned initialisation at random points.
+    """Trains random weights to reproduce the colours and opacities of a learned initialisation at random points.
 
-    "Matched" of Tancik et al. 2021. Opacity is that of a tenth of a radius. Of the objects only the planes are read,
-    and of a NeRF nothing; the rig is that of the reference.
+    This is "Matched" of Tancik et al. 2021. The opacity is `thin_opacity`. Only the planes of the objects are used, and
+    for a NeRF nothing but their bounds. The rig is that of the reference.
 
     Args:
         model: as in `InitialisationObjective`.
@@ -29,7 +29,7 @@ class Matching(InitialisationObjective):
         reference: the learned initialisation, of the same field.
 
     Raises:
-        ValueError: a reference that is another field, or no learned initialisation.
+        ValueError: a reference with another field, or by another method than mv_meta.
     """
 
     def __init__(self, model: HyperPlanes, config: TrainingConfig, reference: HyperPlanes) -> None:
@@ -42,7 +42,7 @@ class Matching(InitialisationObjective):
         model.rig.copy_(self.reference.rig)
 
     def gradients(self, batch: Batch) -> float:
-        """The gradient of the squared differences of the outputs, averaged over the objects."""
+        """Set the gradient of the squared differences of the outputs; returns their mean over the objects."""
         total, count = torch.zeros((), device=self.model.rig.device), len(batch.rendered)
         for draw in batch.rendered:
             prepared, generator = draw.episode.prepared, draw.generator
@@ -50,7 +50,7 @@ class Matching(InitialisationObjective):
             bounds = prepared.occupancy.bounds
             points = points_in(bounds, self.config.rays, generator).to(total)
             directions = normalize(torch.randn(self.config.rays, 3, generator=generator).to(total), dim=1)
-            # both fields there, and their proposals
+            # compare both fields there, and their proposal fields
             ours, theirs = (model.field(prepared, model.theta) for model in (self.model, self.reference))
             for mine, wanted in ((ours.field, theirs.field), (ours.proposal, theirs.proposal)):
                 if mine is None or wanted is None:

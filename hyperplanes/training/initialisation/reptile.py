@@ -1,4 +1,4 @@
-"""Reptile: an initialisation near what gradient descent on each object leads to (Nichol et al. 2018)."""
+"""Reptile: an initialisation near the weights after gradient descent on each object (Nichol et al. 2018)."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ __all__ = ["Reptile"]
 
 
 class Reptile(InitialisationObjective):
-    """theta minus what gradient descent on an object leads to is the gradient that Adam gets (Tancik et al. 2021).
+    """Passes theta minus the weights after gradient descent on an object to Adam as a gradient (Tancik et al. 2021).
 
-    The rays of an object are those of its support views. The loss reported is that of query rays after the descent.
+    Gradient descent uses rays of the support views. The reported loss is that of query rays after it.
     """
 
     def tasks(self, data: Tasks) -> Tasks:
-        """The tasks; for "sv_meta" with one support view each."""
+        """The tasks to train on; for "sv_meta", each has one support view."""
         return SingleView(data) if self.initialisation.method == "sv_meta" else data
 
     @property
     def rays_per_step(self) -> int:
-        """Rays of all inner steps on all objects."""
+        """The number of rays of all inner steps, over all objects."""
         return super().rays_per_step * self.initialisation.inner_steps
 
     def gradients(self, batch: Batch) -> float:
-        """Reptile's gradient, averaged over the objects."""
+        """Set the gradient of Reptile, averaged over the objects; returns the mean loss of query rays."""
         total, adapted = 0.0, []
         theta = self.model.theta.detach()
         for draw in batch.rendered:
@@ -46,7 +46,7 @@ class Reptile(InitialisationObjective):
             weights = descent.weights().detach()
             adapted.append(weights)
             field = self.model.field(episode.prepared, weights)
-            # what is reported: the loss of query rays there
+            # the reported loss, of query rays with the final weights
             with torch.no_grad():
                 rays, truth = draw_rays(episode, field, self.config.rays, generator)
                 total += float(ray_loss(field.trace(rays, generator), truth))
