@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+import warnings
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
 from types import ModuleType
@@ -34,7 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     ended = None
     try:
-        code = _main(arguments)
+        with _one_line_warnings():
+            code = _main(arguments)
     except SystemExit as end:
         code, ended = 0, end
     written = _flush()
@@ -89,6 +91,21 @@ def _main(arguments: Sequence[str] | None) -> int:
         if traceback or not (isinstance(error, ValueError | OSError | MissingPackageError) or is_memory(error)):
             raise
         return _print_error(f"hyperplanes {verb}: {one_line(error)}")
+
+
+@contextmanager
+def _one_line_warnings() -> Generator[None]:
+    """Print a UserWarning as its message, without the place in the code that raised it."""
+    usual = warnings.formatwarning
+
+    def formatted(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> str:
+        return f"warning: {message}\n" if category is UserWarning else usual(message, category, *place, **more)
+
+    warnings.formatwarning = formatted
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def _run(verb: str, name: str, rest: list[str]) -> int:

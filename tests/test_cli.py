@@ -1109,3 +1109,15 @@ def test_a_package_that_is_missing_is_named_in_one_line(monkeypatch, capsys):
     assert main(["view", "example-car", "--downscale", "4"]) == 2
     line = capsys.readouterr().err.strip().splitlines()[-1]
     assert line == "hyperplanes view: expected the package viser, found none; pip install 'hyperplanes[viz]'"
+
+
+def test_warnings_of_commands_are_one_line_without_a_place_in_the_code():
+    script = (
+        "import sys, warnings, hyperplanes.cli as cli\n"
+        "cli._main = lambda arguments: warnings.warn('check cx') or warnings.warn('old', FutureWarning) or 0\n"
+        "sys.exit(cli.main([]))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    first, second = done.stderr.splitlines()[:2]
+    assert first == "warning: check cx"
+    assert second.endswith("FutureWarning: old")
