@@ -176,7 +176,7 @@ def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch
     monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
     assert all_benchmarks.main(["--out", str(tmp_path)]) == 0
     assert {name for name, *_ in ran} == set(benchmarks_main.NAMES) - {*without_rows, *all_benchmarks.OF_DATA}
-    assert "without --data none of views, " in capsys.readouterr().out
+    assert "without --data, views, " in capsys.readouterr().out
     ran.clear()
     assert all_benchmarks.main(["--out", str(tmp_path), "--data", "cars", "--under-load"]) == 0
     assert {words[1] for words in ran} == set(benchmarks_main.NAMES) - without_rows
@@ -269,7 +269,7 @@ def test_other_ways_to_draw_on_a_gpu_show_the_same_field():
 
 @pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
 def test_tables_of_pages_are_the_rows_that_were_measured(page):
-    """Another way to the same: each page is written anew from the results, `python -m benchmarks tables`."""
+    """Another implementation: each page is filled again from the results, as by `python -m benchmarks tables`."""
     text = page.read_text(encoding="utf-8")
     assert tables.fill(text) == text
     assert len(tables.MARKED.findall(text)) == text.count("<!-- benchmarks ")
