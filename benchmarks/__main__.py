@@ -1,7 +1,8 @@
-"""`python -m benchmarks [--under-load] NAME [--quick] [--json FILE]`: one thing against its reference, in one run.
+"""Run a benchmark: `python -m benchmarks [--under-load] NAME [--quick] [--json FILE]`.
 
-`all` makes every row and figure, `tables` the tables of the pages. A benchmark of speed refuses to write rows while
-other processes keep more than `load.LIMIT` cores busy, unless `--under-load` is given; the load stands beside the rows.
+Each benchmark compares an implementation with a reference in the same run. `all` runs all benchmarks, and `tables`
+writes the tables of the documentation. A benchmark of speed refuses to write rows while other processes keep more than
+`load.LIMIT` cores busy, unless `--under-load` is given. The load is stored with the rows.
 """
 
 import sys
@@ -35,13 +36,16 @@ UNDER_LOAD = "--under-load"
 
 
 def main(arguments: list[str]) -> int:
-    """Run the benchmark that the first argument names; the exit code is its own, or 2 when there is none.
+    """Run the benchmark that the first argument names.
 
     Args:
-        arguments: the name, and what its `main` reads.
+        arguments: the name of the benchmark and its own arguments.
+
+    Returns:
+        The exit code of the benchmark; 2 if the name is missing or unknown, the machine is busy, or its input is wrong.
 
     Raises:
-        ValueError: wrong input, where HYPERPLANES_TRACEBACK is set; else one line and the exit code 2.
+        ValueError: wrong input, if HYPERPLANES_TRACEBACK is set; otherwise one line is printed.
         OSError: likewise.
     """
     whatever = arguments[:1] == [UNDER_LOAD]
@@ -54,14 +58,14 @@ def main(arguments: list[str]) -> int:
     load = load_at_start()
     if arguments[0] in OF_SPEED and _keeps_rows(arguments) and load > LIMIT and not whatever:
         print(
-            f"benchmarks {arguments[0]}: expected an idle machine for rows that are kept, found {load:.1f} cores busy; "
-            f"wait, or measure all the same: python -m benchmarks {UNDER_LOAD} {arguments[0]}",
+            f"benchmarks {arguments[0]}: expected an idle machine to write rows, found {load:.1f} cores busy; "
+            f"wait, or measure anyway: python -m benchmarks {UNDER_LOAD} {arguments[0]}",
             file=sys.stderr,
         )
         return 2
     try:
         return int(import_module(f"benchmarks.{arguments[0]}").main(arguments[1:]) or 0)
-    except (ValueError, OSError) as error:  # wrong input, as the command line of hyperplanes takes them
+    except (ValueError, OSError) as error:  # wrong input, reported as the command line of hyperplanes does
         if wants_traceback():
             raise
         print(f"benchmarks {arguments[0]}: {one_line(error)}", file=sys.stderr)
@@ -69,7 +73,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _keeps_rows(arguments: list[str]) -> bool:
-    """Whether --json is given in any of the ways that argparse takes: with "=", and by its first letters."""
+    """Whether --json is given, in any form that argparse accepts: with "=", or abbreviated."""
     names = [word.partition("=")[0] for word in arguments]
     return any(name.startswith("--j") and "--json".startswith(name) for name in names)
 

@@ -1,4 +1,4 @@
-"""Measuring that benchmarks share: interleaved repetitions, ratios with their spread, peak memory, copy bandwidth."""
+"""Measurements that benchmarks share: interleaved repetitions, ratios with quartiles, peak memory, copy bandwidth."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ __all__ = [
     "without",
 ]
 
-os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler announces itself on every start otherwise
+os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # otherwise the profiler prints a line on every start
 
 
 @dataclass
 class Times:
-    """Of one way, by round.
+    """The times of one implementation, one entry per round.
 
     Attributes:
-        wall: seconds that passed.
-        processor: seconds that all threads of this process computed; less disturbed by others on the machine.
+        wall: wall time in seconds.
+        processor: processor time of all threads of this process, in seconds; other processes disturb it less.
     """
 
     wall: list[float] = field(default_factory=list)
@@ -49,16 +49,17 @@ class Times:
 def interleaved(
     ways: dict[str, Callable[[], object]], repeats: int, seconds: float = 60.0, row: int = 1
 ) -> dict[str, Times]:
-    """The times of every way, each in turn, so that all meet the same disturbances.
+    """Measure several implementations alternately, so that other processes disturb all of them equally.
 
     Args:
-        ways: by name; each is run once before, unmeasured.
-        seconds: no further round is begun after this time.
-        row: runs in a row that make one turn, whose mean counts; what is called again and again in real work finds its
-            memory and its caches warm, which a single run after another way does not.
+        ways: the implementations by name. Each is first called once without being measured.
+        repeats: the largest number of rounds. A round measures each implementation once.
+        seconds: no round starts later than this.
+        row: number of consecutive calls per measurement, of which the mean is taken. In real work, a function that is
+            called repeatedly finds its memory and caches warm. A single call after another implementation does not.
 
     Returns:
-        Times of each way.
+        The times of each implementation, per call.
     """
     for run in ways.values():
         run()
@@ -77,7 +78,7 @@ def interleaved(
 
 
 def add_device_option(parser: argparse.ArgumentParser, default: str) -> None:
-    """Adds --device, a name of PyTorch; one that is not here ends the program with a line."""
+    """Add the option --device, the name of a PyTorch device; argparse reports one that this machine does not have."""
 
     def known(name: str) -> str:
         try:
@@ -85,25 +86,25 @@ def add_device_option(parser: argparse.ArgumentParser, default: str) -> None:
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
 
-    parser.add_argument("--device", type=known, default=default, help="what computes (default: %(default)s)")
+    parser.add_argument("--device", type=known, default=default, help="a PyTorch device (default: %(default)s)")
 
 
 def timed(run: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of a call, all that it left to a GPU included, and what it returned."""
+    """The wall time of a call in seconds, including the work that it queued on a GPU, and its result."""
     begun = clock()
     result = run()
     return clock() - begun, result
 
 
 def ratio(reference: list[float], ours: list[float]) -> dict[str, float]:
-    """How many times faster ours is: median and quartiles over the rounds, each round compared with itself."""
+    """The speedup of `ours` over `reference` in each round: its median and quartiles over the rounds."""
     rounds = sorted(theirs / mine for theirs, mine in zip(reference, ours, strict=True))
     quartiles = statistics.quantiles(rounds, n=4, method="inclusive") if len(rounds) > 1 else rounds * 3
     return dict(zip(("speedup_low", "speedup", "speedup_high"), quartiles, strict=True))
 
 
 def peak_bytes(run: Callable[[], object], device: str = "cpu") -> int:
-    """The most memory that PyTorch and NumPy held for one run, beyond what was there before, results included."""
+    """The peak memory in bytes that PyTorch and NumPy allocate during a call, including its results."""
     if device != "cpu":
         torch.cuda.reset_peak_memory_stats()
         held = torch.cuda.memory_allocated()
@@ -128,7 +129,7 @@ def peak_bytes(run: Callable[[], object], device: str = "cpu") -> int:
 
 
 def copy_bandwidth(megabytes: int = 512, device: str = "cpu") -> float:
-    """Bytes a second, read and written together, of the best of five copies of a large array."""
+    """Bytes read and written per second, in the fastest of five copies of a large array."""
     source = torch.ones(megabytes << 18, device=device)
     target = torch.empty_like(source)
     times = interleaved({"copy": lambda: target.copy_(source)}, 5)["copy"]
@@ -136,7 +137,7 @@ def copy_bandwidth(megabytes: int = 512, device: str = "cpu") -> float:
 
 
 def table(rows: list[dict[str, Any]], columns: list[str]) -> str:
-    """The rows as text, one column each."""
+    """The rows as a text table with aligned columns."""
     cells = [columns] + [[_text(row.get(column)) for column in columns] for row in rows]
     widths = [max(len(line[index]) for line in cells) for index in range(len(columns))]
     return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in cells)
@@ -149,10 +150,10 @@ def _text(value: object) -> str:
 
 
 def without(owner: type, check: str) -> AbstractContextManager[object]:
-    """While it lasts, a kernel is not used.
+    """A context in which a class does not use its kernel.
 
     Args:
-        owner: the class that uses it.
-        check: its method that says whether the kernel takes something; it says no.
+        owner: the class.
+        check: its method that returns whether the kernel supports an input; in the context it returns False.
     """
     return patch.object(owner, check, lambda *_: False)

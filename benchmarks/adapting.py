@@ -1,10 +1,10 @@
-"""Adapting to one object, from its files: seconds, and PSNR on views that were not shown.
+"""Adapt to one object from its files; measure seconds, and PSNR on query views.
 
     python -m benchmarks adapting --views data/chair --json FILE
 
-Each way begins with reading the files and ends with something that renders: the packaged model in one forward pass; its
-field as voxels that are fitted to the views; and, as the reference, fine-tuning of the model. Rendering the views that
-are compared is not part of the time.
+Three methods are compared: one forward pass of the packaged model; voxels that are baked from its field and fitted to
+the support views; and, as the reference, fine-tuning of the model. The time includes reading the files, but not
+rendering the query views.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ TUNING = "fine-tuned"
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks adapting", description=__doc__)
-    parser.add_argument("--views", type=Path, help="posed images; a procedural car when not given")
+    parser.add_argument("--views", type=Path, help="posed images (default: a procedural car)")
     parser.add_argument("--checkpoint", default="small", help="the model (default: %(default)s)")
-    parser.add_argument("--fit", type=int, nargs="+", default=[STEPS, 2 * STEPS], help="steps of fitting voxels")
-    parser.add_argument("--side", type=positive, help="voxels an axis; those of pages when not given")
-    parser.add_argument("--steps", type=int, default=100, help="of fine-tuning, the reference; 0 leaves it out")
-    parser.add_argument("--query", type=positive, default=10, help="views that are compared (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="a small car, few steps: to see that it runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--fit", type=int, nargs="+", default=[STEPS, 2 * STEPS], help="steps for fitting voxels")
+    parser.add_argument("--side", type=positive, help="voxels per axis (default: as for exported pages)")
+    parser.add_argument("--steps", type=int, default=100, help="steps of fine-tuning, the reference; 0 omits it")
+    parser.add_argument("--query", type=positive, default=10, help="number of query views (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="a small car and few steps, to check that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     if chosen.quick:
         chosen.fit, chosen.side, chosen.steps, chosen.query = [2], 32, 1, 1
@@ -88,7 +88,7 @@ def _voxels(model: HyperPlanes, side: int | None, fit: int, views: Views) -> Bak
 
 
 def _warm_up(model: HyperPlanes, task: Task) -> None:
-    """What is compiled or kept by the first use of each way, on a small copy of the views."""
+    """Use each method once on small copies of the views, so that compilation and caches are not measured."""
     views = task.support.resized(32)
     _voxels(model, 32, 1, views).render(task.query[:1].cameras)
     model.fine_tune(views, 1).render(task.query[:1].resized(32).cameras)

@@ -1,12 +1,12 @@
-"""Every benchmark: rows and figures in benchmarks/results, and the tables of the pages.
+"""Run all benchmarks; write rows and figures to benchmarks/results, and the tables of the documentation.
 
     python -m benchmarks all
     python -m benchmarks all --root data --data data/cars data/chairs --scene chair --meshes miner.glb taxi.glb
 
-Each runs in a process of its own, and writes the commit, the hardware and the load beside its rows. Those of speed run
-one after the other, then those of quality several at once; the seconds in the rows of these say little. Those that
-judge or train models need data sets: the suites of `benchmarks/views.py` below --root, others --data. Without --scene
-and --meshes, procedural objects are adapted to and photographed in place of those of the pages.
+Each benchmark runs in its own process, and writes the commit, the hardware and the load with its rows. Benchmarks of
+speed run first, one at a time. Benchmarks of quality then run in parallel, so that their times mean little. Those that
+evaluate or train models need data sets: the suites of `benchmarks/views.py` in the folder --root, and the data sets of
+--data. Without --scene and --meshes, procedural objects replace the objects that the documentation shows.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ COMMANDS: dict[str, list[str]] = {
     "generation": [],
     "captures": ["--checkpoint", "small", "--size", "640"],
 }
-"""Names of results, and options of the benchmarks beside --json and --plot."""
+"""The names of results, and the options of their benchmarks other than --json and --plot."""
 
 OF_GPU = {"gpu": ["--compile"], "lookup_gpu": ["--device", "cuda"]}
-"""Likewise, of those that run where PyTorch sees a CUDA device."""
+"""Likewise, for results that need a CUDA device."""
 
 OF_DATA = ("views", "baked", "image_based", "hypernetwork")
-"""Those that are given --data."""
+"""Benchmarks that read the data sets of --data."""
 
 MORE = {"baked": ["--objects", "2", "--query", "4", "--counts", "25", "3"]}
-"""Options of those beside --data."""
+"""The options of these benchmarks other than --data."""
 
 _METHODS = ["--methods", "nearest_view", "hull_blend", "hull_blend_reflected", "unreflected"]
 _TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", *_METHODS, "uncorrected"]
@@ -75,25 +75,25 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_tuned": (["procedural", "cc0", "random"], ["--objects", "10", "--seeds", "3", *_TUNED]),
     "views_tuned_posed": (["posed"], ["--seeds", "5", *_TUNED]),
 }
-"""Results of `views` by suites below --root, and its options, in place of `views` by --data."""
+"""Results of `views` on suites, with the suites and the other options; with --root they replace `views` on --data."""
 
 PLOTTED = {"lookup": "lookup.png", "rendering": "rendering.png", "training_curves": "training_curves.png"}
-"""Pictures of results, in the same folder."""
+"""Figures of results, in the same folder."""
 
 
 def main(arguments: list[str]) -> int:
-    """Run all, and say which failed."""
+    """Run all benchmarks, and print which of them failed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks all", description=__doc__)
-    parser.add_argument("--out", type=Path, default=RESULTS, help="the folder of the results (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the results (default: %(default)s)")
     parser.add_argument("--data", type=Path, nargs="+", default=[],
-                        help=f"data sets for {', '.join(OF_DATA)}; the first one for steps and gpu")  # fmt: skip
-    parser.add_argument("--root", type=Path, help="the folder of the data sets of suites")
-    parser.add_argument("--scene", type=Path, help="posed images that are adapted to and, with --data, baked")
-    parser.add_argument("--meshes", type=Path, nargs="+", help="objects of the captures")
-    parser.add_argument("--quick", action="store_true", help="the short way of each: to see that they run")
-    parser.add_argument("--under-load", action="store_true", help="measure beside other work, too")
-    parser.add_argument("--workers", type=int, default=usable_cores(), help="how many of those that judge quality run "
-                        "at once; those of speed run alone, before (default: %(default)s)")  # fmt: skip
+                        help=f"data sets for {', '.join(OF_DATA)}; steps and gpu use the first one")  # fmt: skip
+    parser.add_argument("--root", type=Path, help="folder with the data sets of the suites")
+    parser.add_argument("--scene", type=Path, help="posed images for adapting and, with --data, for baked")
+    parser.add_argument("--meshes", type=Path, nargs="+", help="mesh files for captures")
+    parser.add_argument("--quick", action="store_true", help="run each with --quick, to check that it runs")
+    parser.add_argument("--under-load", action="store_true", help="measure even if other processes are busy")
+    parser.add_argument("--workers", type=int, default=usable_cores(), help="how many benchmarks of quality run in "
+                        "parallel; those of speed run alone, before them (default: %(default)s)")  # fmt: skip
     chosen = parser.parse_args(arguments)
     if chosen.workers < 1:
         parser.error(f"--workers: expected at least 1, got {chosen.workers}")
@@ -104,18 +104,19 @@ def main(arguments: list[str]) -> int:
     failed = _run(of_speed, 1, {}) + _run(others, chosen.workers, threads)
     print(f"benchmarks all: {len(commands) - len(failed)} of {len(commands)} done", *failed, sep="; failed: ")
     if not chosen.data:
-        print(f"benchmarks all: without --data none of {', '.join(OF_DATA)}")
+        print(f"benchmarks all: without --data, {', '.join(OF_DATA)} did not run")
     if chosen.out == RESULTS and not chosen.quick:
         tables.main([])
     return 1 if failed else 0
 
 
 def _run(commands: dict[str, list[str]], workers: int, settings: dict[str, str]) -> list[str]:
-    """Run commands, so many at once, print how long each took, and return the names of those that failed.
+    """Run commands, print how long each took, and return the names of those that failed.
 
     Args:
         commands: by the names of their results.
-        settings: of their environment, where it does not say otherwise.
+        workers: how many run in parallel.
+        settings: environment variables, unless they are set already.
     """
 
     def failed(name: str) -> bool:
@@ -128,11 +129,11 @@ def _run(commands: dict[str, list[str]], workers: int, settings: dict[str, str])
     try:
         return [name for name, bad in zip(commands, pool.map(failed, commands), strict=True) if bad]
     finally:
-        pool.shutdown(cancel_futures=True)  # the rest, after an interrupt
+        pool.shutdown(cancel_futures=True)  # after an interrupt, the others do not start
 
 
 def _commands(chosen: argparse.Namespace) -> dict[str, tuple[str, list[str]]]:
-    """The benchmark of each result and its command."""
+    """The name of the benchmark that makes each result, and its command."""
     data, scene = ["--data", *map(str, chosen.data)], [str(chosen.scene)] if chosen.scene else []
     first = data[:2] if chosen.data else []
     given = {"adapting": ["--views", *scene] if scene else [], "steps": first, "gpu": first}
@@ -152,7 +153,7 @@ def _commands(chosen: argparse.Namespace) -> dict[str, tuple[str, list[str]]]:
         plot = ["--plot", str(chosen.out / PLOTTED[name])] if name in PLOTTED else []
         command = [sys.executable, "-m", "benchmarks", *(["--under-load"] if chosen.under_load else []), benchmark]
         command += [*source, *(["--quick"] if chosen.quick else [*more, *plot])]
-        if not chosen.quick or chosen.out != RESULTS:  # the rows of pages are none of the short way
+        if not chosen.quick or chosen.out != RESULTS:  # quick rows never replace those of the documentation
             command += ["--json", str(chosen.out / f"{name}.json")]
         result[name] = benchmark, command
     return result

@@ -1,11 +1,11 @@
-"""Baked voxels against the field that they were baked from: PSNR on views that neither was shown, and time.
+"""Compare baked voxels with the field that they were baked from: PSNR on query views, and time.
 
     python -m benchmarks baked --data data/cars data/chairs --json FILE
     python -m benchmarks baked --suite cc0 --counts 5 25 --json FILE
 
-Of every held-out object so many views are shown to the model, and some others are rendered by its field, by the voxels
-as they were baked, and by the voxels after they were fitted to the shown views. The reference of every time is the
-field, in the same run.
+The model adapts to some views of each held-out object. Query views are rendered from its field, from the voxels as
+baked, and from the voxels after they are fitted to the support views. The reference for all times is the field, in the
+same run.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ __all__ = ["main"]
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks baked", description=__doc__)
     add_data_options(parser)
     parser.add_argument("--counts", type=positive, nargs="+", default=[25], help="numbers of support views")
-    parser.add_argument("--objects", type=positive, default=3, help="of each data set")
-    parser.add_argument("--query", type=positive, default=3, help="views of each object to be judged by")
-    parser.add_argument("--side", type=positive, help="voxels an axis; those of pages when not given")
-    parser.add_argument("--fit", type=int, default=STEPS, help="steps of fitting (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="one object, few steps: to see that it runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--objects", type=positive, default=3, help="number of objects per data set")
+    parser.add_argument("--query", type=positive, default=3, help="number of query views per object")
+    parser.add_argument("--side", type=positive, help="voxels per axis (default: as for exported pages)")
+    parser.add_argument("--fit", type=int, default=STEPS, help="steps for fitting voxels (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="one object and few steps, to check that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     if chosen.quick:
         chosen.counts, chosen.objects, chosen.query, chosen.side, chosen.fit = [3], 1, 1, 32, 2
@@ -63,9 +63,12 @@ def main(arguments: list[str]) -> int:
 
 
 def measure(model: HyperPlanes, task: Task, side: int | None, fit: int) -> dict[str, float]:
-    """One object: PSNR by the field, the voxels and the fitted voxels, and seconds; times of a view are medians."""
+    """For one object, the PSNR of the field, the voxels and the fitted voxels, and the times of baking and rendering.
+
+    The time of a view is the mean over the query views.
+    """
     adapted, cameras = model.adapt(task.support).without_residuals(), task.query.cameras
-    adapted.render(task.query[:1].cameras)  # compiles, and refines the occupancy
+    adapted.render(task.query[:1].cameras)  # compiles kernels and refines the occupancy before the measurement
     field_seconds, by_field = timed(lambda: adapted.render(cameras))
     bake_seconds, baked = timed(lambda: bake(adapted, side=side or default_side(task.support.size)))
     guide_seconds, guide = timed(lambda: render_guide(adapted, task.support))

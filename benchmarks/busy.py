@@ -1,11 +1,11 @@
-"""The same work by one, two and all threads, on the machine as it is and beside processes that keep every core busy.
+"""Time the same work with one, two and all threads, on an idle machine and while other processes use every core.
 
     python -m benchmarks busy --json FILE
 
-Each way is a process of its own, since OpenMP reads how its threads wait when PyTorch is loaded: "passive" as
-`import hyperplanes` sets it, "active" as PyTorch has it where nobody decides. Which cores a process gets differs from
-process to process, so that each way is several of them in turn. The reference of every row is one thread under the same
-load. More threads are never to be slower than one.
+Each setting runs in its own process, because OpenMP reads its wait policy when PyTorch is loaded: "passive", as
+`import hyperplanes` sets it, or "active", the default of PyTorch. The cores that a process gets differ between
+processes, so that each setting is measured in several. The reference of every row is one thread under the same load.
+More threads should never be slower than one.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ __all__ = ["main"]
 
 WORKS = ("lookup", "carving", "rendering", "fine_tuning", "training")
 SPIN = "while True: pass"
-WARM, SHORTEST = 0.5, 1.0  # seconds of work before the first repetition, and of all repetitions at least
+WARM, SHORTEST = 0.5, 1.0  # seconds of work before the first measurement; least seconds of all repetitions
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks busy", description=__doc__)
     parser.add_argument("--works", nargs="+", choices=WORKS, default=list(WORKS))
     parser.add_argument("--policies", nargs="+", choices=("passive", "active"), default=["passive"])
-    parser.add_argument("--repeats", type=positive, default=3, help="in each process (default: %(default)s)")
+    parser.add_argument("--repeats", type=positive, default=3, help="repetitions per process (default: %(default)s)")
     parser.add_argument(
-        "--rounds", type=positive, default=3, help="processes of each way, in turn (default: %(default)s)"
+        "--rounds", type=positive, default=3, help="processes per setting, interleaved (default: %(default)s)"
     )
-    parser.add_argument("--quick", action="store_true", help="small and once: to see that it runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
-    parser.add_argument("--measure", choices=WORKS, help=argparse.SUPPRESS)  # what a process of its own does
+    parser.add_argument("--quick", action="store_true", help="little work, measured once, to check that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
+    parser.add_argument("--measure", choices=WORKS, help=argparse.SUPPRESS)  # internal: what the measured processes do
     chosen = parser.parse_args(arguments)
     if chosen.measure:
         print(json.dumps(_seconds(chosen.measure, 1 if chosen.quick else chosen.repeats, chosen.quick)))
@@ -74,7 +74,7 @@ def main(arguments: list[str]) -> int:
 
 @contextmanager
 def _busy(count: int) -> Generator[None]:
-    """So many processes beside this one that do nothing but spin."""
+    """While active, `count` other processes run busy loops."""
     others = [subprocess.Popen([sys.executable, "-c", SPIN]) for _ in range(count)]
     try:
         yield
@@ -85,7 +85,7 @@ def _busy(count: int) -> Generator[None]:
 
 
 def _in_process(work: str, threads: int, policy: str, chosen: argparse.Namespace) -> list[float]:
-    """The seconds of every repetition in a process of so many threads that wait so."""
+    """The seconds of every repetition in a new process with this number of threads and this wait policy."""
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": policy.upper()}
     environment.pop("GOMP_SPINCOUNT", None)
     command = [sys.executable, "-m", "benchmarks", "busy", "--measure", work, "--repeats", str(chosen.repeats)]
@@ -95,7 +95,10 @@ def _in_process(work: str, threads: int, policy: str, chosen: argparse.Namespace
 
 
 def _seconds(name: str, repeats: int, quick: bool) -> list[float]:
-    """The wall time of every repetition, after some that are not measured: caches, compilation, sleeping cores."""
+    """The wall time of every repetition in seconds.
+
+    Unmeasured repetitions come first: they fill caches, compile kernels and wake idle cores.
+    """
     work, times = _work(name, quick), []
     work()
     warm, begun = time.perf_counter() + (0 if quick else WARM), time.perf_counter()
@@ -110,7 +113,7 @@ def _seconds(name: str, repeats: int, quick: bool) -> list[float]:
 
 
 def _work(name: str, quick: bool) -> Callable[[], object]:
-    """One repetition of a work, on the scene and the model that come with the package."""
+    """A function that does one repetition of the named work, with the packaged scene and model."""
     import torch
 
     from hyperplanes.adaptation.base import hull
@@ -135,7 +138,7 @@ def _work(name: str, quick: bool) -> Callable[[], object]:
 
 
 def _training(model: HyperPlanes, task: Task) -> Callable[[], object]:
-    """Steps of the packaged model's training, ten views of each object."""
+    """A function that takes one training step of the packaged model, with ten views of each object."""
     from benchmarks.training import UNSEEN, Objects
     from hyperplanes.configuration.presets import preset
     from hyperplanes.training import Trainer

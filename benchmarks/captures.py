@@ -1,16 +1,18 @@
-"""Poses and masks that `capture` finds for staged photographs, against those that they were taken with.
+"""Compare the poses and masks that `capture` finds in simulated photographs with the true ones.
 
     python -m benchmarks captures --meshes MESH_OR_FOLDER ... --checkpoint small --json FILE
 
-Every object stands on a table in a textured room and is photographed through a lens, with other exposures, blur and
-noise for each picture. The poses that were found are brought into the true world by the similarity that fits the
-cameras' centres best; masks are compared where the lens has been taken out. With --checkpoint, a model adapts to half
-of the views, and the other half, over white by their true masks, are compared with its renderings: with what was found,
-with what is true, with masks that are damaged on purpose (a quarter of them lacks a part, or has one too many, and all
-are soft), and without masks, with a learned background and without.
+Each object stands on a table in a textured room. It is photographed through a lens with distortion, with a different
+exposure, blur and noise for each photograph. The estimated poses are aligned to the true ones by the similarity
+transform that fits the camera centres best. Masks are compared in undistorted images.
 
-Each scene is measured in parts, which are kept in the folder --keep: the same call of the same commit goes on where it
-was interrupted. Rows of other scenes that FILE holds stay there, with the commit that they were measured with.
+With --checkpoint, a model adapts to half of the views, and its renderings are compared with the other half, composited
+over white by their true masks. This is done with the estimated poses and masks, with the true ones, with damaged masks
+(all have soft borders; in a quarter of them a part of the object is missing, or something else is included), and
+without masks, with and without a learned background.
+
+Each scene is measured in parts, whose results are stored in the folder --keep. If the benchmark is interrupted, the
+same command at the same commit continues from there. Rows of other scenes remain in FILE, with their own commits.
 """
 
 from __future__ import annotations
@@ -62,36 +64,37 @@ from hyperplanes.views import Views
 
 __all__ = ["PoseErrors", "compare_poses", "damaged_masks", "main"]
 
-SHOWN, COMPARED = 320, 160  # pixels along the longer side of the views that are shown, and of those compared
-HEIGHTS = (12.0, 35.0, 58.0)  # of the rounds, in degrees: with 36 photographs a step of 30 degrees
-OCTAVES = 4  # of the noise on table and walls: a coarse texture, with few details to recognise
-SOFT = 0.008  # of the longer side: deviation of the blur of a damaged mask
-PART = 0.25  # of the area of the object, that is lost or added
+SHOWN, COMPARED = 320, 160  # pixels along the longer side of support views and of query views
+HEIGHTS = (12.0, 35.0, 58.0)  # elevations of the camera, in degrees; 36 photographs are then 30 degrees apart
+OCTAVES = 4  # octaves of the noise on table and walls; few, so that there are few image features
+SOFT = 0.008  # standard deviation of the blur of a damaged mask, as a fraction of the longer side
+PART = 0.25  # area that a damaged mask loses or gains, as a fraction of the object's area
 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """How far poses are from true ones.
+    """Errors of estimated camera poses.
 
     Attributes:
-        degrees: between the rotations, for each camera.
-        percent: between the centres, of the true distance from the origin, which they look at.
+        degrees: angle between the estimated and the true rotation of each camera.
+        percent: distance between the estimated and the true centre of each camera, in percent of the true distance
+            from the origin, which the cameras look at.
     """
 
     degrees: Float[np.ndarray, " camera"]
     percent: Float[np.ndarray, " camera"]
 
     def within(self, degrees: float, percent: float) -> float:
-        """The fraction of cameras that are right to so much."""
+        """The fraction of cameras whose errors are at most these."""
         return float(((self.degrees <= degrees) & (self.percent <= percent)).mean())
 
 
 def compare_poses(found: Float[np.ndarray, "camera 4 4"], true: Float[np.ndarray, "camera 4 4"]) -> PoseErrors:
-    """Errors after the similarity that brings the found centres nearest to the true ones (Umeyama, 1991).
+    """Errors of poses after a similarity transform that aligns their centres with the true ones (Umeyama, 1991).
 
     Args:
-        found: world_from_camera.
-        true: likewise, in the true world.
+        found: estimated poses, world_from_camera.
+        true: true poses, world_from_camera.
     """
     source, target = found[:, :3, 3], true[:, :3, 3]
     shifted, wanted = source - source.mean(0), target - target.mean(0)
@@ -109,21 +112,21 @@ def compare_poses(found: Float[np.ndarray, "camera 4 4"], true: Float[np.ndarray
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks captures", description=__doc__)
-    parser.add_argument("--meshes", type=Path, nargs="+", help="meshes, and folders of them; ellipsoids if not given")
-    parser.add_argument("--count", type=positive, default=3, help="objects of each folder, or ellipsoids")
-    parser.add_argument("--views", type=positive, default=36)
+    parser.add_argument("--meshes", type=Path, nargs="+", help="mesh files, or folders of them (default: ellipsoids)")
+    parser.add_argument("--count", type=positive, default=3, help="number of objects per folder, or of ellipsoids")
+    parser.add_argument("--views", type=positive, default=36, help="photographs per object (default: %(default)s)")
     parser.add_argument("--size", type=positive, default=560, help="pixels along the longer side")
-    parser.add_argument("--mask", default="auto", help="as of `hyperplanes capture`")
-    parser.add_argument("--checkpoint", help="a model to compare new views with")
+    parser.add_argument("--mask", default="auto", help="as for `hyperplanes capture`")
+    parser.add_argument("--checkpoint", help="a model whose new views are compared")
     parser.add_argument(
-        "--parts", nargs="+", choices=list(PARTS), default=list(PARTS), help="of a measurement (default: all)"
+        "--parts", nargs="+", choices=list(PARTS), default=list(PARTS), help="what to measure (default: all)"
     )
     parser.add_argument(
-        "--keep", type=Path, default=Path("runs/captures"), help="for photographs and scenes (default: %(default)s)"
+        "--keep", type=Path, default=Path("runs/captures"), help="folder for scenes (default: %(default)s)"
     )
-    parser.add_argument("--quick", action="store_true", help="one object, 24 small pictures; nothing is kept")
+    parser.add_argument("--quick", action="store_true", help="one object, 24 small photographs; nothing is stored")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     if options.quick:
@@ -141,7 +144,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _scenes(options: argparse.Namespace) -> list[_Scene]:
-    """One for each mesh."""
+    """One scene per mesh."""
     paths: dict[str, Path | None] = {}
     if options.meshes is None:
         paths = {f"ellipsoid_{index}": None for index in range(options.count)}
@@ -155,7 +158,7 @@ def _scenes(options: argparse.Namespace) -> list[_Scene]:
 
 
 def _rows_of_others(path: Path | None, names: set[str]) -> list[Row]:
-    """The rows of a file that are not about to be measured."""
+    """The rows of a file except those of the named scenes, which are measured again."""
     if path is None or not path.is_file():
         return []
     return [row for row in json.loads(path.read_text(encoding="utf-8"))["rows"] if row["name"] not in names]
@@ -163,7 +166,7 @@ def _rows_of_others(path: Path | None, names: set[str]) -> list[Row]:
 
 @dataclass(frozen=True)
 class _Scene:
-    """An object that is photographed, and what is kept of its measurement."""
+    """An object that is photographed, and the stored results of its measurement."""
 
     name: str
     path: Path | None
@@ -180,7 +183,7 @@ class _Scene:
         return self.options.keep / self.name
 
     def measure(self) -> Row:
-        """All parts, those left out that were done."""
+        """The results of all parts; parts that are done already are read from the folder."""
         row: Row = {"name": self.name, "commit": find_commit(), "views": self.options.views}
         stages = Stages(self.folder)
         for part, measured in PARTS.items():
@@ -199,17 +202,17 @@ class _Scene:
 
     @property
     def scene(self) -> Path:
-        """What `capture` writes."""
+        """The folder that `capture` writes."""
         return self.folder / "capture" / "scene"
 
     @cached_property
     def model(self) -> SparseModel:
-        """What structure from motion found."""
+        """The result of structure from motion."""
         return SparseModel.load(self.scene / "capture" / "poses" / "model.npz")
 
     @cached_property
     def truth(self) -> dict[str, Pixels]:
-        """The photographs that were posed, with their true masks, as the cameras that were found have them."""
+        """The posed photographs with their true masks as alpha, undistorted by the estimated cameras."""
         found = zip(self.model.pictures.tolist(), self.model.calibrations, self.model.lenses, strict=True)
         return {_name(view): _straight(self.staged, view, calibration, lens) for view, calibration, lens in found}
 
@@ -219,9 +222,9 @@ class _Scene:
 
 
 def _captured(scene: _Scene) -> Row:
-    """Poses and masks that were found."""
+    """Errors of the estimated poses and masks."""
     photographs = scene.folder / "capture" / "photographs"
-    if not photographs.is_dir():  # else their capture was interrupted, and goes on
+    if not photographs.is_dir():  # otherwise an interrupted capture continues
         scene.staged.save(photographs)
     captured = capture(photographs, scene.scene, Settings(scene.options.size, scene.options.mask))
     errors = compare_poses(np.linalg.inv(scene.model.camera_from_world), _true_poses(scene))
@@ -236,12 +239,12 @@ def _captured(scene: _Scene) -> Row:
 
 
 def _true_poses(scene: _Scene) -> Float[np.ndarray, "camera 4 4"]:
-    """Of the photographs that were posed, world_from_camera."""
+    """The true poses of the posed photographs, world_from_camera."""
     return scene.staged.world_from_camera[scene.model.pictures]
 
 
 def _new_views(scene: _Scene) -> Row:
-    """Views that the model was not shown, by what was found and by what is true."""
+    """PSNR of query views with the estimated and with the true poses and masks."""
     staged, folder = scene.staged, scene.folder / "views" / "true"
     true = {_name(view): _straight(staged, view, staged.calibration, staged.lens) for view in range(len(staged.masks))}
     _write_true(folder, staged, true)
@@ -256,7 +259,7 @@ def _name(view: int) -> str:
 
 
 def _straight(staged: Staged, view: int, calibration: np.ndarray, lens: Sequence[float]) -> Pixels:
-    """A photograph with its true mask as alpha, without its lens."""
+    """A photograph with its true mask as alpha, undistorted."""
     rgba = np.concatenate([staged.photographs[view], 255 * staged.masks[view][..., None].astype(np.uint8)], -1)
     return undistort(rgba, calibration, (*lens, *(0.0,) * 6))
 
@@ -267,7 +270,7 @@ def _read_masks(scene: Path, names: Iterable[str]) -> list[np.ndarray]:
 
 
 def _overlap(masks: Sequence[np.ndarray], truth: Mapping[str, Pixels]) -> float:
-    """Mean intersection over union of masks with the true ones."""
+    """Mean intersection over union of masks and true masks."""
     result = []
     for mask, picture in zip(masks, truth.values(), strict=True):
         found, true = mask > 0.5, picture[..., 3] > 127
@@ -276,7 +279,7 @@ def _overlap(masks: Sequence[np.ndarray], truth: Mapping[str, Pixels]) -> float:
 
 
 def _write_true(folder: Path, staged: Staged, pictures: Mapping[str, Pixels]) -> None:
-    """The scene with true poses and masks."""
+    """Write the scene with its true poses and masks."""
     for name, picture in pictures.items():
         write_whole(folder / "images" / f"{name}.png", encode_png(picture), durable=False)
     calibrations = np.tile(staged.calibration, (len(pictures), 1, 1))
@@ -289,21 +292,23 @@ def _write_true(folder: Path, staged: Staged, pictures: Mapping[str, Pixels]) ->
 def _quality(
     scene: Path, method: Adapter, truth: Mapping[str, Pixels], prepare: Callable[[Views], Views] | None = None
 ) -> float:
-    """PSNR in dB of the views that were not shown, against the photographs over white by their true masks.
+    """PSNR in dB of the query views, compared with the photographs composited over white by their true masks.
 
     Args:
-        method: what adapts to half of it.
-        prepare: what is done with the support views before.
+        scene: folder of a scene.
+        method: the method that adapts to half of the scene's views.
+        truth: the photographs with their true masks as alpha, by name.
+        prepare: a function applied to the support views first.
 
     Returns:
-        PSNR; NaN where the masks leave nothing.
+        The mean PSNR; NaN if the visual hull is empty.
     """
     task = read_task(scene, up="auto")
     shown = (task.support if prepare is None else prepare(task.support)).resized(SHOWN)
     cameras = task.query.resized(COMPARED).cameras
     try:
         pictures = method.adapt(shown).render(cameras).images.clamp(0, 1)
-    except ValueError:  # a hull that is carved to nothing
+    except ValueError:  # the visual hull is empty
         return float("nan")
     wanted = np.stack([truth[Path(name).stem] for name in task.query.names]).transpose(0, 3, 1, 2)
     true, _ = composite_over_white(torch.from_numpy(np.ascontiguousarray(wanted)))
@@ -312,7 +317,10 @@ def _quality(
 
 
 def _damaged(scene: _Scene) -> Row:
-    """What masks that are wrong on purpose do: as they are, mended by one mask's word, and by the vote of all."""
+    """Quality with damaged masks: as they are, and corrected with hulls from which one or several masks remove a point.
+
+    Several masks are what `capture` requires.
+    """
     truth, model = scene.truth, scene.model
     masks = damaged_masks([picture[..., 3] / 255 for picture in truth.values()], scene.seed)
     around = object_sphere(model, object_points(model, masks))
@@ -336,10 +344,11 @@ def _damaged(scene: _Scene) -> Row:
 
 
 def damaged_masks(masks: Sequence[np.ndarray], seed: int) -> list[np.ndarray]:
-    """Masks with soft borders, of which a quarter, at random, lacks a part of the object or holds something beside it.
+    """Masks with soft borders; a random quarter of them loses or gains a disc at the border of the object.
 
     Args:
         masks: opacity in [0, 1].
+        seed: of the random choices.
     """
     generator = np.random.default_rng(seed)
     result = [ndimage.gaussian_filter(mask.astype(float), SOFT * max(mask.shape)) for mask in masks]
@@ -354,7 +363,7 @@ def damaged_masks(masks: Sequence[np.ndarray], seed: int) -> list[np.ndarray]:
 
 
 def _without_masks(scene: _Scene) -> Row:
-    """The same poses without masks: as the model takes them, and with a learned background."""
+    """Quality without masks, with the same poses: as the images are, and with a learned background."""
 
     def bare(views: Views) -> Views:
         pictures = np.stack([scene.truth[Path(name).stem][..., :3] for name in views.names]).transpose(0, 3, 1, 2)
@@ -374,4 +383,4 @@ PARTS: dict[str, Callable[[_Scene], Row]] = {
     "damaged": _damaged,
     "without_masks": _without_masks,
 }
-"""Of a measurement, in their order; all but the first need a model."""
+"""The parts of a measurement, in order; all but the first need a model."""

@@ -1,10 +1,10 @@
-"""Training of the gating network of a model whose pictures are means with those of the visual hull.
+"""Train the gating network of a model, which weights its pictures and those of `hull_blend`.
 
     python -m benchmarks gating --data data/cars data/random --objects 24 --out FOLDER
 
-Each held-out object is shown by a random number of views, upright and in a random orientation. The objects must be none
-that the model was trained on, nor those of any table. A copy of the model with the gating network is written, and what
-it is worth is measured by `python -m benchmarks views --methods ungated unstacked`.
+Each held-out object gives two examples, one upright and one in a random orientation, each from a random number of
+views. The objects must be neither in the training data of the model nor in any table of results. The result is a copy
+of the model with the gating network. `python -m benchmarks views --methods ungated unstacked` measures its effect.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from hyperplanes.training.gating import GatingExample, example_of, fit_gate, tur
 
 __all__ = ["main"]
 
-COUNTS = (3, 5, 7, 10, 15, 25, 40)  # of the views that an object is shown by
+COUNTS = (3, 5, 7, 10, 15, 25, 40)  # numbers of support views
 QUERY = 2
 
 
 def main(arguments: list[str]) -> int:
-    """Train, and write the model."""
+    """Train the gating network, and write the model."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks gating", description=__doc__)
     add_data_options(parser)
-    parser.add_argument("--objects", type=positive, default=24, help="held-out ones of each data set")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", required=True, help="where the model goes")
-    parser.add_argument("--quick", action="store_true", help="one object: to see that it runs")
+    parser.add_argument("--objects", type=positive, default=24, help="held-out objects per data set")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", required=True, help="folder to write the model to")
+    parser.add_argument("--quick", action="store_true", help="one object, to check that it runs")
     chosen = parser.parse_args(arguments)
     model = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint)))
     draws, generator, examples = random.Random(0), torch.Generator().manual_seed(0), list[GatingExample]()

@@ -1,13 +1,13 @@
-"""How fast data sets are generated, against the obvious loop: one process, a new pyrender renderer for every mesh.
+"""Compare the speed of data set generation with a plain loop: one process, and a new pyrender renderer per mesh.
 
-Both make the same procedural cars, draw the same 50 views of each at 128x128, and write RGBA PNGs; both times include
-the start of their processes, but not the one-time search for a renderer. They take turns, so that both meet the same
-disturbances, and for about as long each. The loop draws with what pyrender does by itself, four samples a pixel of
-which one is shaded; ours shades each of four, or of nine, the default.
+Both make the same procedural cars, render the same 50 views of each at 128x128, and write RGBA PNGs. Both times include
+starting their processes, but not the one-time search for a renderer. Rounds of both alternate and take about equally
+long, so that other processes disturb both equally. The loop uses the default multisampling of pyrender, four samples
+per pixel of which one is shaded; `data_gen` shades each of four, or of nine, the default.
 
-Speed is told by the clock, and by processor time, which counts all that the processes computed on any core and is less
-disturbed by others on the machine; `load` is how many processes wanted a core, ours included. A thousand objects are
-extrapolated, from the time until the first is done and that of each further one.
+Speed is measured in wall time and in processor time. Processor time counts the work of all processes on all cores, and
+other processes disturb it less. `load` is the load average, including this benchmark. The time for 1,000 objects is
+extrapolated from the time until the first object is done and the time for each further one.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ THOUSAND = 1000
 
 @dataclass(frozen=True)
 class Run:
-    """What one generation took.
+    """The times of one generation.
 
     Attributes:
-        images: that it wrote.
-        wall: seconds that passed.
-        processor: seconds that all its processes computed.
+        images: number of images that it wrote.
+        wall: wall time in seconds.
+        processor: processor time of all its processes in seconds.
         first: seconds until the first object was done.
         each: seconds for each further object.
     """
@@ -56,10 +56,10 @@ class Run:
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print the rows, and write them as JSON where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks generation", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer objects and rounds")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     options = parser.parse_args(arguments)
     from data_gen.rendering.renderers import find_renderer
 
@@ -71,19 +71,22 @@ def main(arguments: list[str]) -> int:
 
 
 def compare(renderer: str, folder: Path, *, rounds: int, objects: int) -> list[Row]:
-    """Images a second of `data_gen.datasets.generate.generate` and of the obvious loop, which needs OpenGL.
+    """Images per second of `data_gen.datasets.generate.generate` and of the plain loop, which needs OpenGL.
 
     Args:
-        renderer: a name in `data_gen.rendering.renderers.RENDERERS`.
-        objects: how many ours makes a round; the loop makes a sixth.
+        renderer: a name in `data_gen.rendering.renderers.RENDERERS`; without one of pyrender, the loop does not run.
+        folder: where the images are written.
+        rounds: number of rounds.
+        objects: number of objects that `generate` makes per round; the loop makes a sixth of it.
 
     Returns:
-        A row for each number of samples, `speedup` with its quartiles over the rounds, and one for 1,000 objects.
+        A row for each number of samples per pixel, with `speedup` and its quartiles over the rounds, and a row with the
+        time for 1,000 objects.
     """
     counts = (2, SUPERSAMPLE)
     ours: dict[int, list[Run]] = {supersample: [] for supersample in counts}
     loop: list[Run] = []
-    # Nothing is deleted between rounds: ext4 looks long for an inode among those that were deleted a moment ago.
+    # Nothing is deleted between rounds, because ext4 takes long to find a free inode among recently deleted ones.
     for turn in range(rounds):
         if renderer.startswith("pyrender"):
             loop.append(looped(objects // 6, folder / f"loop{turn}", renderer))
@@ -115,7 +118,7 @@ def _speed(runs: list[Run]) -> Row:
 
 
 def measured(run: Callable[[], int]) -> Run:
-    """What a generation takes, which returns how many images it wrote."""
+    """The times of a generation. `run` returns how many images it wrote."""
     begun, computed = time.perf_counter(), _computed()
     images = run()
     wall, processor = time.perf_counter() - begun, _computed() - computed
@@ -129,10 +132,12 @@ def _computed() -> float:
 
 
 def generated(objects: int, out: Path, supersample: int = SUPERSAMPLE) -> Run:
-    """What `data_gen.datasets.generate.generate` takes for cars, with a worker a core.
+    """The times of `data_gen.datasets.generate.generate` for cars, with one worker per core.
 
     Args:
-        supersample: samples along a side of a pixel.
+        objects: number of cars.
+        out: where the images are written.
+        supersample: samples per pixel along each axis.
     """
     from data_gen.datasets.generate import GenerationConfig, Procedural, generate
 
@@ -150,10 +155,12 @@ def generated(objects: int, out: Path, supersample: int = SUPERSAMPLE) -> Run:
 
 
 def looped(objects: int, out: Path, renderer: str) -> Run:
-    """What the obvious loop takes, in a process of its own.
+    """The times of the plain loop, in a separate process.
 
     Args:
-        renderer: that draws, one of pyrender's.
+        objects: number of cars.
+        out: where the images are written.
+        renderer: one of the renderers of pyrender.
     """
     told: dict[str, float] = {}
 
@@ -170,13 +177,17 @@ def looped(objects: int, out: Path, renderer: str) -> Run:
 
 
 def memory(objects: int, folder: Path) -> Row:
-    """The memory of parent and workers while many small objects stream through, workers not recycled.
+    """The memory of the parent process and its workers during the generation of many small objects.
+
+    Workers are not recycled, so that a memory leak shows.
 
     Args:
-        objects: how many, with 2 views of 32x32 each.
+        objects: number of objects, with 2 views of 32x32 each.
+        folder: where the images are written.
 
     Returns:
-        Medians of the resident memory in MB over the second and the last tenth of the objects, and the growth.
+        A row with medians of the resident memory in MiB over the second and the last tenth of the objects, and its
+        growth per object.
     """
     from data_gen.datasets.generate import GenerationConfig, Procedural, generate
 
@@ -195,7 +206,7 @@ def memory(objects: int, folder: Path) -> Row:
 
 
 def resident_megabytes() -> float:
-    """Resident memory of this process and its children."""
+    """Resident memory of this process and its children, in MiB."""
     processes = [os.getpid()]
     for task in Path("/proc/self/task").iterdir():
         processes += map(int, (task / "children").read_text().split())
@@ -204,5 +215,5 @@ def resident_megabytes() -> float:
         try:
             total += int(Path(f"/proc/{process}/statm").read_text().split()[1])
         except FileNotFoundError:
-            continue  # it has ended meanwhile
+            continue  # the process has ended
     return total * os.sysconf("SC_PAGE_SIZE") / 2**20

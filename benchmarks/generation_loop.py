@@ -1,7 +1,7 @@
-"""The obvious loop, which `benchmarks.generation` runs in a process of its own.
+"""The plain loop over meshes, which `benchmarks.generation` runs in a separate process.
 
-`python -m benchmarks.generation_loop COUNT OUT` prints one line of JSON. Nothing of PyTorch is imported here, for that
-would count as the start of the process.
+`python -m benchmarks.generation_loop COUNT OUT` prints one line of JSON. This module does not import PyTorch, because
+the time of the import would count.
 """
 
 from __future__ import annotations
@@ -18,10 +18,15 @@ VIEWS, RESOLUTION = 50, 128
 
 
 def obvious_loop(objects: int, out: Path) -> dict[str, float]:
-    """What one would write first with pyrender: a new renderer for every mesh, whose pictures it draws and writes.
+    """Render cars with pyrender in the simplest way, with a new renderer for each mesh, and write the images.
+
+    Args:
+        objects: number of cars.
+        out: where the images are written.
 
     Returns:
-        The number of images, the seconds until the first object was done, imports included, and those of each further.
+        The number of images, the seconds until the first object is done, including imports, and the seconds for each
+        further object.
     """
     begun = time.perf_counter()
     import numpy as np

@@ -1,13 +1,13 @@
-"""Views, adapting and training on a GPU, and what each way of drawing a view there takes and loses.
+"""Measure rendering, adapting and training on a GPU, and compare several implementations of rendering there.
 
     python -m benchmarks gpu --json FILE
     python -m benchmarks gpu --data data/cars --json FILE
 
-Views by `small` and by the paper's network, of a car that no training saw, 25 views shown. Beside the way they are
-drawn: lookups by PyTorch in place of the fused kernel; single precision without TF32; layers in bfloat16; and the
-function of the field, all colours included, as it is, replayed as a CUDA graph and, by --compile, compiled by
-`torch.compile`. All in turn, in one process, medians. The paper's protocol asks two networks at 64 + 192 places of
-every ray.
+`small` and the paper's network render views of a held-out car from 25 support views. The default is compared with
+lookups by PyTorch instead of the fused kernel; with single precision without TF32; with layers in bfloat16; and with
+the field as one function that computes the colour of every sample: directly, replayed as a CUDA graph and, with
+--compile, compiled by `torch.compile`. All run alternately in one process; times are medians. The paper's protocol
+evaluates two networks, the coarse one at 64 and the fine one at 192 samples per ray.
 """
 
 from __future__ import annotations
@@ -53,20 +53,20 @@ PAPER = Path(__file__).parent / "weights" / "paper-network"
 PAPER_SAMPLES = Hierarchical(64, 128)
 SHOWN, COMPARED = 25, 4
 SIZES = (128, 200, 400)
-SIZE_OF_WAYS = 200  # pixels of a side at which the ways are compared
-SPAN = 1 << 14  # points by which graphs and compiled functions differ in size
+SIZE_OF_WAYS = 200  # pixels per side for the comparison of implementations
+SPAN = 1 << 14  # graphs and compiled functions are made for multiples of this number of points
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks gpu", description=__doc__)
-    parser.add_argument("--data", type=Path, help="a data set; a procedural car where absent")
+    parser.add_argument("--data", type=Path, help="a data set (default: a procedural car)")
     add_device_option(parser, "cuda")
-    parser.add_argument("--steps", type=int, default=100, help="of fine-tuning (default: %(default)s)")
-    parser.add_argument("--repeats", type=positive, default=7, help="of each view (default: %(default)s)")
-    parser.add_argument("--compile", action="store_true", help="compile the paper's network, too: a minute or two")
-    parser.add_argument("--quick", action="store_true", help="few and small views: to see that it runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--steps", type=int, default=100, help="steps of fine-tuning (default: %(default)s)")
+    parser.add_argument("--repeats", type=positive, default=7, help="repetitions per view (default: %(default)s)")
+    parser.add_argument("--compile", action="store_true", help="also compile the paper's network, in 1 to 2 minutes")
+    parser.add_argument("--quick", action="store_true", help="few and small views, to check that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     device = torch.device(chosen.device)
     sizes, repeats, steps = ((48,), 1, 1) if chosen.quick else (SIZES, chosen.repeats, chosen.steps)
@@ -79,14 +79,14 @@ def main(arguments: list[str]) -> int:
 
 
 def views(checkpoint: str, data: Tasks, device: torch.device, sizes: tuple[int, ...], repeats: int) -> list[Row]:
-    """Views of each size as they are drawn, and of one size by all ways."""
+    """Rows for views of each size by default, and for views of one size by all implementations."""
     model, name = HyperPlanes.from_pretrained(checkpoint).to(device), Path(checkpoint).name
     rows: list[Row] = []
     for size in sizes:
         task = _task(data, size, device)
         adapted = model.adapt(task.support).without_residuals()
         drawn = {"default": _drawing(adapted, antialias=True), "one ray a pixel": _drawing(adapted)}
-        if not isinstance(adapted, StackedField):  # the hull beside such a one has no coarse pass
+        if not isinstance(adapted, StackedField):  # the second field of a StackedField has no coarse network
             drawn["paper's protocol"] = _drawing(adapted, sampling=PAPER_SAMPLES)
         if size == _size_of_ways(sizes):
             drawn |= _ways(adapted, device)
@@ -99,7 +99,7 @@ def _size_of_ways(sizes: tuple[int, ...]) -> int:
 
 
 def _task(data: Tasks, size: int, device: torch.device) -> Task:
-    """The first held-out object: 25 views that are shown, and some that are not, of so many pixels."""
+    """The first held-out object, with 25 support views and some query views of `size` pixels per side."""
     names = sorted(data.names("test") or data.names("train"))
     task = _Resized(Shown(data, SHOWN, COMPARED), size).task(names[0])
     return Task(task.support.to(device), task.query.to(device), task.name)
@@ -107,7 +107,7 @@ def _task(data: Tasks, size: int, device: torch.device) -> Task:
 
 @dataclass(frozen=True)
 class _Resized(TaskWrapper):
-    """Tasks with pictures of so many pixels."""
+    """Tasks whose images have `size` pixels per side."""
 
     size: int
 
@@ -117,12 +117,12 @@ class _Resized(TaskWrapper):
 
 @dataclass(frozen=True)
 class Drawing:
-    """A way of drawing views.
+    """An implementation of rendering.
 
     Attributes:
         adapted: the field.
-        options: of its `render`.
-        around: a context in which it is drawn.
+        options: options of its `render`.
+        around: a context in which it renders.
     """
 
     adapted: AdaptedField
@@ -141,7 +141,7 @@ def _drawing(
 
 
 def _ways(adapted: AdaptedField, device: torch.device) -> dict[str, Drawing]:
-    """One ray a pixel: other ways, each in place of one thing, and other ways of evaluating the field."""
+    """Variants of rendering with one ray per pixel: each replaces one part, or how the field is evaluated."""
     found = {
         "lookups by PyTorch": _drawing(adapted, _lookups_by_pytorch),
         "no TF32": _drawing(adapted, _without_tf32),
@@ -154,14 +154,14 @@ def _ways(adapted: AdaptedField, device: torch.device) -> dict[str, Drawing]:
 
 
 def compiled(data: Tasks, device: torch.device, size: int, repeats: int) -> list[Row]:
-    """A view by the paper's network, compiled for numbers of points that are rounded up."""
+    """Rows for a view by the paper's network, compiled for numbers of points that are rounded up."""
 
     def change(function: FieldFunction) -> FieldFunction:
         fast = torch.compile(function, dynamic=False)
 
         def padded(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
             count = len(points)
-            colour, density = fast(*(pad(each, (0, 0, 0, _room(count) - count)) for each in (points, directions)))
+            colour, density = fast(*(pad(each, (0, 0, 0, _rounded_up(count) - count)) for each in (points, directions)))
             return colour[:count], density[:count]
 
         return padded
@@ -176,7 +176,10 @@ def compiled(data: Tasks, device: torch.device, size: int, repeats: int) -> list
 
 
 def _with_functions(adapted: AdaptedField, change: Callable[[FieldFunction], FieldFunction]) -> AdaptedField:
-    """A field, and the one beside it if there is one, as functions of points and directions, changed in some way."""
+    """A field whose network is replaced by `change` of a function of points and directions.
+
+    The second field of a `StackedField` is changed, too.
+    """
 
     def function(one: AdaptedField) -> FieldFunction:
         return change(lambda points, directions: one.field(points, directions))
@@ -190,7 +193,7 @@ def _with_functions(adapted: AdaptedField, change: Callable[[FieldFunction], Fie
 
 @contextmanager
 def _layers_in_bfloat16(device: str) -> Generator[None]:
-    """While it lasts, the layers before the heads multiply numbers of bfloat16."""
+    """While active, the layers before the heads are computed in bfloat16."""
     trunk = Field.trunk
 
     def rounded(field: Field, inputs: Tensor) -> Tensor:
@@ -201,16 +204,16 @@ def _layers_in_bfloat16(device: str) -> Generator[None]:
         yield
 
 
-def _room(count: int) -> int:
-    """A number of points, rounded up."""
+def _rounded_up(count: int) -> int:
+    """A number of points, rounded up to a multiple of SPAN."""
     return -(-max(1, count) // SPAN) * SPAN
 
 
 class Graphed:
-    """A field whose work is recorded once for every number of points, rounded up, and replayed.
+    """A field that is recorded as a CUDA graph once for each number of points, rounded up, and then replayed.
 
     Args:
-        function: of points and directions, without gradients, that waits for nothing.
+        function: a function of points and directions, without gradients, that does not synchronise with the GPU.
     """
 
     def __init__(self, function: FieldFunction) -> None:
@@ -220,16 +223,16 @@ class Graphed:
     def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Colours and densities."""
         count = len(points)
-        room = _room(count)
-        if room not in self.graphs:
-            self.graphs[room] = self._record(room, points.device)
-        graph, tensors = self.graphs[room]
+        padded = _rounded_up(count)
+        if padded not in self.graphs:
+            self.graphs[padded] = self._record(padded, points.device)
+        graph, tensors = self.graphs[padded]
         tensors[0][:count], tensors[1][:count] = points, directions
         graph.replay()
         return tensors[2][:count].clone(), tensors[3][:count].clone()
 
-    def _record(self, room: int, device: torch.device) -> tuple[torch.cuda.CUDAGraph, list[Tensor]]:
-        inputs = [torch.zeros(room, 3, device=device) for _ in range(2)]
+    def _record(self, count: int, device: torch.device) -> tuple[torch.cuda.CUDAGraph, list[Tensor]]:
+        inputs = [torch.zeros(count, 3, device=device) for _ in range(2)]
         inputs[1][:, 0] = 1
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
@@ -256,7 +259,7 @@ def _without_tf32() -> Generator[None]:
 
 
 def _compare(name: str, task: Task, drawn: dict[str, Drawing], repeats: int) -> list[Row]:
-    """All ways in turn, view by view; those that do not work say why in place of a row."""
+    """A row for each implementation, measured alternately; for one that fails, the row has the error instead."""
     one, several, working = camera.select(task.query.cameras, [1]), task.query.cameras, {}
     rows: list[Row] = []
     for way, draw in drawn.items():
@@ -264,7 +267,7 @@ def _compare(name: str, task: Task, drawn: dict[str, Drawing], repeats: int) -> 
             first, _ = timed(lambda draw=draw: draw(one))
             images = draw(several)
             draw(one)
-        except Exception as error:  # whatever a compiler raises
+        except Exception as error:  # compilers raise many types
             rows.append({"name": f"{name}, {way}", "error": f"{type(error).__name__}: {str(error)[:300]}"})
             continue
         working[way] = draw
@@ -282,7 +285,7 @@ def _compare(name: str, task: Task, drawn: dict[str, Drawing], repeats: int) -> 
 
 
 def adapting(data: Tasks, device: torch.device, steps: int) -> list[Row]:
-    """Adapting `small` to an object, with and without the search for symmetry, and fine-tuning it."""
+    """Rows for adapting `small` to an object, with and without the search for symmetry, and for fine-tuning it."""
     task = _task(data, 128, device)
     model = HyperPlanes.from_pretrained("small").to(device)
     plain = HyperPlanes.from_pretrained("small").to(device)
@@ -305,7 +308,7 @@ def adapting(data: Tasks, device: torch.device, steps: int) -> list[Row]:
 
 
 def training(data: Tasks, device: torch.device, repeats: int) -> list[Row]:
-    """Steps of training of `small`, whose objects are ready, with few and with many rays."""
+    """Rows for training steps of `small` with few and with many rays, on objects that are already prepared."""
     settings, rows = preset("small").training, list[Row]()
     data = _Resized(data, 128)
     for rays in (settings.rays, 16 * settings.rays):

@@ -1,8 +1,8 @@
-"""What each choice in the hypernetwork is worth: variants trained alike, judged on objects that none of them saw.
+"""Ablations of the hypernetwork: variants are trained in the same way and evaluated on held-out objects.
 
-Every variant trains the preset "quick" with the same objects, rays and steps, and differs in what its name says. Its
-PSNR on held-out objects is compared with the same field without a hypernetwork, and with the update of another object.
-The data sets come first, for example
+Every variant trains the preset "quick" with the same objects, rays and steps, and changes what its name says. Its PSNR
+on held-out objects is compared with that of the same field without a hypernetwork, and with the update of another
+object. The data sets are made first, for example:
 
     hyperplanes generate --class car --count 210 --held-out 10 --resolution 64 --seed 0 --out data/car
     python -m benchmarks hypernetwork --data data/car --planes 5 --variant none low_rank --json table.json
@@ -51,27 +51,27 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "no_warmup": ("full rates from the first step", {}),
     "paper_rates": ("1e-4 for theta and the hypernetwork by Adam, no warm-up, no schedule", {}),
 }  # fmt: skip
-"""Names, what they change, and the entries of ImageHyperNetworkConfig that differ from the preset's."""
+"""For each variant, what it changes, and the fields of ImageHyperNetworkConfig that differ from the preset."""
 
 PAPER_RATES = {"learning_rate": 1e-4, "hypernetwork_learning_rate": 1e-4, "warmup": 0, "final_rate_factor": 1.0}
 TRAINING: dict[str, dict[str, Any]] = {"no_warmup": {"warmup": 0}, "paper_rates": {"optimiser": "adam", **PAPER_RATES}}
-"""The entries of TrainingConfig that a variant changes."""
+"""The fields of TrainingConfig that a variant changes."""
 
 
 def main(arguments: list[str]) -> int:
-    """Train, print, and write the rows where asked."""
+    """Train the variants, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks hypernetwork", description=__doc__)
-    parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets, a class each")
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets, one per class")
     parser.add_argument("--variant", nargs="+", choices=VARIANTS, default=["none", "low_rank"])
-    parser.add_argument("--planes", type=positive, default=25, help="ImagePlanes of the field")
-    parser.add_argument("--optimiser", choices=("adam", "muon"), default="muon", help="of theta")
-    parser.add_argument("--tasks", type=positive, default=4, help="objects a step; 768 rays are shared among them")
-    parser.add_argument("--references", type=int, default=0, help="further objects a step that are not rendered")
+    parser.add_argument("--planes", type=positive, default=25, help="number of ImagePlanes of the field")
+    parser.add_argument("--optimiser", choices=("adam", "muon"), default="muon", help="optimiser of theta")
+    parser.add_argument("--tasks", type=positive, default=4, help="objects per step; they share 768 rays")
+    parser.add_argument("--references", type=int, default=0, help="more objects per step, which are not rendered")
     parser.add_argument("--steps", type=int, default=1200)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--quick", action="store_true", help="20 steps: to see that it runs")
-    parser.add_argument("--out", type=Path, help="folder for checkpoints; interrupted trainings go on")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--quick", action="store_true", help="20 steps, to check that it runs")
+    parser.add_argument("--out", type=Path, help="folder for checkpoints, from which interrupted trainings continue")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     data = open_datasets(chosen.data)
     steps = 20 if chosen.quick else chosen.steps
@@ -94,8 +94,10 @@ def variant(name: str, *, planes: int = 25, optimiser: str = "muon", tasks: int 
 
     Args:
         name: one of VARIANTS.
-        planes: of the field; the hypernetwork reads as many views, at most 5.
-        tasks: objects a step.
+        planes: number of ImagePlanes of the field; the hypernetwork reads as many views, at most 5.
+        optimiser: of theta; "adam" or "muon".
+        tasks: objects per step.
+        steps: training steps.
     """
     made, changes = preset("quick"), VARIANTS[name][1]
     trained = {"optimiser": optimiser, **TRAINING.get(name, {})}
@@ -110,15 +112,17 @@ def variant(name: str, *, planes: int = 25, optimiser: str = "muon", tasks: int 
 
 
 def measure(made: Preset, data: Tasks, folder: Path | None = None, views: int = 4) -> Row:
-    """Train and judge on the held-out objects.
+    """Train a variant, and evaluate it on the held-out objects.
 
     Args:
-        data: tasks; names begin with the name of their class where there are several.
-        views: query views of each object that are compared.
+        made: the variant.
+        data: tasks; with several classes, names begin with the class.
+        folder: for checkpoints; None writes none.
+        views: number of query views per object.
 
     Returns:
-        PSNR in dB with an object's own update and with that of the next object of its class, spread and norm of the
-        updates, seconds of training.
+        PSNR in dB with the update of each object itself and with the update of the next object of its class, spread and
+        norm of the updates, and seconds of training.
     """
     model = HyperPlanes(made.model, made.training.seed)
     trainer = Trainer(model, data, made.training, folder)
@@ -134,7 +138,7 @@ def measure(made: Preset, data: Tasks, folder: Path | None = None, views: int = 
 
 @torch.no_grad()
 def judge(model: HyperPlanes, data: Tasks, views: int) -> Row:
-    """The figures of a trained model; as `measure`."""
+    """Evaluate a trained model; the result is as in `measure`, without the seconds."""
     names = list(data.names("test"))
     episodes = []
     for name in names:

@@ -1,10 +1,10 @@
-"""What the parts of the field of any number of views are worth: each left out, trained again and judged by views shown.
+"""Ablations of the image-based field: each variant omits one part, is trained, and is evaluated by number of views.
 
     python -m benchmarks image_based --data data/cars --json FILE
 
-Every variant is trained for the same steps on the same rays of random numbers of random views, and judged on held-out
-objects by 3, 5, 10 and 25 views that stand as far apart as they can. The network is smaller than that of the preset
-"small", so that a training takes minutes.
+Every variant is trained for the same number of steps on the same rays, with random numbers of random support views. It
+is evaluated on held-out objects from 3, 5, 10 and 25 support views that are as far apart as possible. The network is
+smaller than that of the preset "small", so that a training takes minutes.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ __all__ = ["HYPERNETWORKS", "VARIANTS", "configured", "main", "trained"]
 
 
 class _WithoutDepth(ImageBasedNeRF):
-    """Every view that shows a point counts as seeing it."""
+    """A field for which every view onto which a point projects counts as seeing it, even if the point is occluded."""
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> VisibilityPlanes:
         planes = super().planes_of(views, occupancy)
-        planes.depth_opacity[..., 0] = 1e3  # the first surface lies behind everything
+        planes.depth_opacity[..., 0] = 1e3  # the depth of the first surface: behind all points
         return planes
 
 
 class _WithoutCoverage(ImageBasedNeRF):
-    """Nothing is known of the masks but the hull that is sampled."""
+    """A field that does not read the masks; they only determine the visual hull in which samples are taken."""
 
     def planes_of(self, views: Views, occupancy: Occupancy) -> VisibilityPlanes:
         planes = super().planes_of(views, occupancy)
@@ -56,7 +56,7 @@ class _WithoutCoverage(ImageBasedNeRF):
 
 
 class _Unsorted(VisibilityPlanes):
-    """The views of a point in the order of the object's, as far as they show it."""
+    """Planes that return the valid views of a point in the order of the object's views, not by penalty."""
 
     def choose(self, points: Tensor, directions: Tensor | None = None, *, best: int, nearest: int = 0) -> Visibility:
         found = super().choose(points, directions, best=len(self), nearest=nearest)
@@ -76,7 +76,7 @@ class _WithoutOrder(ImageBasedNeRF):
 
 @dataclass(frozen=True)
 class _PlainField(ImageBasedField):
-    """The colour is the network's alone."""
+    """A field whose colour comes from the network alone; colours of the views are not blended."""
 
     def _blend(self, value: Tensor, weights: Tensor, colours: Tensor) -> Tensor:
         return super()._blend(value, weights, torch.full_like(colours, 0.5))
@@ -89,7 +89,7 @@ class _WithoutBlending(ImageBasedNeRF):
 
 
 class _RandomStart(ImageBasedNeRF):
-    """The density head begins as that of the other fields, not as the visual hull."""
+    """A field whose density head is initialised like those of other fields, not to reproduce the visual hull."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -99,7 +99,13 @@ class _RandomStart(ImageBasedNeRF):
 
 @dataclass(frozen=True)
 class _Reader:
-    """What of the hypernetwork is changed or left out."""
+    """A variant of the hypernetwork.
+
+    Attributes:
+        images: it reads images instead of a volume.
+        grid: the field has a feature grid, which the hypernetwork writes.
+        completed: the loss that completes the volume is used in training.
+    """
 
     images: bool = False
     grid: bool = True
@@ -111,7 +117,7 @@ HYPERNETWORKS = {
     "without_completion": _Reader(completed=False),
     "reads_images": _Reader(images=True, grid=False, completed=False),
 }
-"""What the hypernetwork of the field is worth, and what its parts are."""
+"""Variants with a hypernetwork: the whole, and with changes."""
 
 VARIANTS: dict[str, type[ImageBasedNeRF]] = {
     "whole": ImageBasedNeRF,
@@ -124,16 +130,16 @@ VARIANTS: dict[str, type[ImageBasedNeRF]] = {
 
 
 def main(arguments: list[str]) -> int:
-    """Train, print, and write the rows where asked."""
+    """Train the variants, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks image_based", description=__doc__)
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="data sets")
     parser.add_argument("--variant", nargs="+", choices=(*VARIANTS, *HYPERNETWORKS, "white"), default=list(VARIANTS))
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--counts", type=positive, nargs="+", default=[3, 5, 10, 25], help="numbers of support views")
-    parser.add_argument("--objects", type=positive, default=4, help="held-out ones of each data set to judge by")
+    parser.add_argument("--objects", type=positive, default=4, help="held-out objects per data set to evaluate on")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--quick", action="store_true", help="2 steps: to see that it runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--quick", action="store_true", help="2 steps, to check that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     if chosen.quick:
         chosen.steps, chosen.counts, chosen.objects = 2, [3], 1
@@ -155,17 +161,20 @@ def main(arguments: list[str]) -> int:
 
 
 def _judged(model: HyperPlanes, data: Dataset, count: int, objects: int) -> float:
-    """Mean PSNR of three query views of each of some held-out objects with so many views shown."""
+    """Mean PSNR of three query views of each of `objects` held-out objects, from `count` support views."""
     return evaluate("one_step", model, Shown(data, count, 3), sorted(data.names("test"))[:objects]).mean("psnr")
 
 
 def configured(name: str, steps: int, seed: int) -> Preset:
-    """The preset "small" with a network of 3 x 96, a hull of 64 voxels an axis, 128 rays an object, and one change.
+    """A variant of the preset "small", with a network of 3 x 96, a hull of 64 voxels per axis, and 128 rays per object.
 
-    Objects are not rotated, and pictures are the field's alone.
+    Objects are not rotated, and pictures are rendered from the field alone, without `hull_blend`.
 
     Args:
-        name: of VARIANTS, "white" or HYPERNETWORKS; only the last have a hypernetwork.
+        name: in VARIANTS or HYPERNETWORKS, or "white", which trains without random backgrounds. Only those in
+            HYPERNETWORKS have a hypernetwork.
+        steps: training steps.
+        seed: of the training.
     """
     TARGETS[name] = VARIANTS.get(name, ImageBasedNeRF)
     made, wanted = preset("small"), HYPERNETWORKS.get(name)
@@ -188,12 +197,12 @@ def configured(name: str, steps: int, seed: int) -> Preset:
     if wanted is not None and wanted.images:
         reader = replace(ALL_LAYERS, join="mean", views=6, resolution=64)
     model = replace(made.model, target=name, network=network, hypernetwork=reader, hull_resolution=64)
-    model = replace(model, stacked=False, symmetric=False)  # what the field alone shows
+    model = replace(model, stacked=False, symmetric=False)  # evaluate the field alone
     return replace(made, model=model, training=training)
 
 
 def trained(made: Preset, data: Any) -> HyperPlanes:
-    """A model after its training."""
+    """Train a model of this preset; it is returned in evaluation mode."""
     model = HyperPlanes(made.model, made.training.seed)
     trainer = Trainer(model, data, made.training)
     while trainer.step < made.training.steps:

@@ -1,4 +1,4 @@
-"""How busy other processes keep the machine, which every figure of speed depends on."""
+"""The load of the machine by other processes, which affects every measured time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 __all__ = ["LIMIT", "OF_SPEED", "load_at_start", "measure_load"]
 
-LIMIT = 0.3  # cores that others may use beside a measurement that is kept
+LIMIT = 0.3  # cores that other processes may use when rows are written
 OF_SPEED = frozenset(
     {
         "adapting",
@@ -33,12 +33,12 @@ STATISTICS = Path("/proc/stat")
 
 @cache
 def load_at_start() -> float:
-    """What `measure_load` found when this was first called, which is before the benchmark's own work."""
+    """The result of `measure_load` at the first call, before the work of the benchmark begins."""
     return measure_load()
 
 
 def measure_load(seconds: float = 1.0) -> float:
-    """Cores that are busy while this process sleeps; the load average of a minute where Linux does not tell."""
+    """The number of cores that are busy while this process sleeps; without /proc/stat, the load average of a minute."""
     if not STATISTICS.exists():
         return os.getloadavg()[0]
     before, begun = _busy_ticks(), time.perf_counter()
@@ -48,6 +48,6 @@ def measure_load(seconds: float = 1.0) -> float:
 
 
 def _busy_ticks() -> int:
-    """Clock ticks of all cores in which something ran: user, nice, system, interrupts, stolen."""
+    """Busy clock ticks of all cores so far: user, nice, system, interrupts, soft interrupts, stolen."""
     user, nice, system, _, _, interrupt, soft, stolen, *_ = map(int, STATISTICS.read_text().splitlines()[0].split()[1:])
     return user + nice + system + interrupt + soft + stolen

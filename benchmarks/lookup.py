@@ -1,14 +1,16 @@
-"""How fast points are projected onto planes and colours sampled there, against two ways of doing it with Kornia.
+"""Compare the speed of lookups (projecting points onto ImagePlanes and sampling colours there) with Kornia's functions.
 
-`kornia_loop` takes camera after camera: `PinholeCamera.project`, `normalize_pixel_coordinates`, `grid_sample`;
-`kornia_batched` takes all cameras at once, with the points expanded to every camera. `torch` is our plain reference,
-`cpu` the fused kernel on the images themselves, `cpu_packed` the same on 32 bits a pixel (the default where images
-need no gradient), `triton` the fused kernel on a GPU. A lookup is one point on one plane, colours and coordinates out.
-Points are random in a ball, the worst case for caches. Sampling alone starts from Kornia's coordinates. Every way is
-called three times in a row, as work calls it again and again, before the next has its turn.
+`kornia_loop` uses one camera after the other: `PinholeCamera.project`, `normalize_pixel_coordinates`, `grid_sample`.
+`kornia_batched` uses all cameras at once, with the points expanded to every camera. `torch` is the reference in PyTorch
+of this package, `cpu` its fused kernel on the images, `cpu_packed` the same kernel on images packed into 32 bits per
+pixel (the default if images need no gradient), and `triton` its fused kernel on a GPU. A lookup is one point on one
+plane, and returns a colour and coordinates. Points are random in a ball, which is the worst case for caches. Sampling
+alone starts from coordinates as Kornia normalises them. Each implementation is called three times in a row before the
+next one, because real work calls it repeatedly.
 
-`speedup` is wall time over `kornia_loop`'s in the same round, with quartiles; `speedup_processor` compares the
-processor time of both, which other work on the machine disturbs less. With `--threads 1` the two are alike.
+`speedup` is the wall time of `kornia_loop` divided by that of the implementation in the same round, with quartiles.
+`speedup_processor` is the same for processor time, which other processes disturb less. With `--threads 1` the two are
+similar.
 """
 
 from __future__ import annotations
@@ -36,12 +38,14 @@ COLUMNS += ["copy_fraction"]
 
 
 def measure(scene: Scene, part: str, gradient: bool, repeats: int, bandwidth: float | None) -> list[Row]:
-    """A row for every way of doing one part, all in interleaved repetitions.
+    """A row for each implementation of one part of a lookup, with interleaved repetitions.
 
     Args:
+        scene: cameras, images and points.
         part: "projection", "sampling" or "both".
-        gradient: with the pull-back to points and images.
-        bandwidth: of a copy on this machine, in bytes a second; without it, memory is not looked at.
+        gradient: also compute the gradients of points and images.
+        repeats: number of rounds.
+        bandwidth: of a copy on this machine, in bytes per second; None measures no memory.
     """
     calls = runs(*ways(scene, part), gradient)
     times = interleaved(calls, repeats, row=CALLS)
@@ -68,7 +72,10 @@ def measure(scene: Scene, part: str, gradient: bool, repeats: int, bandwidth: fl
 
 
 def sweep(repeats: int, quick: bool, device: str) -> list[Row]:
-    """Growth with planes, points and resolution, one at a time from the standard setting."""
+    """Rows for other numbers of planes, points or pixels; one of them varies, the others are standard.
+
+    The standard number of points is a quarter of that of STANDARD.
+    """
     planes, points, size = STANDARD
     points //= 4
     counts = [1, 25, 200] if quick else [1, 2, 5, 10, 25, 50, 100, 200]
@@ -84,12 +91,12 @@ def sweep(repeats: int, quick: bool, device: str) -> list[Row]:
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print the table, and write JSON and a plot where asked."""
+    """Measure, print the tables, and write JSON and a plot if the options ask for them."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks lookup", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer repetitions and settings, within a minute")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of them goes (PNG)")
-    parser.add_argument("--threads", type=int, metavar="N", help="of PyTorch and of the kernels")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="PNG file to plot them to")
+    parser.add_argument("--threads", type=int, metavar="N", help="number of threads of PyTorch and the kernels")
     add_device_option(parser, "cpu")
     options = parser.parse_args(arguments)
     if options.threads:

@@ -1,4 +1,4 @@
-"""The lookup benchmark as one picture: bars for the standard setting, lines for what grows."""
+"""A figure of the lookup benchmark: bars for the standard setting, lines for the sweeps."""
 
 from __future__ import annotations
 
@@ -26,10 +26,12 @@ AXES = {"planes": "planes", "points": "points", "resolution": "pixels along a si
 
 
 def plot(rows: list[Row], path: Path, title: str) -> None:
-    """The standard setting as bars, the sweeps as lines, in one picture.
+    """Plot the standard setting as bars and the sweeps as lines, in one figure.
 
     Args:
-        title: the machine, in words.
+        rows: the rows of the benchmark.
+        path: the file to write.
+        title: of the figure; names the machine.
     """
     figure = new_figure(13, 8)
     figure.suptitle(title, fontsize=11)
@@ -45,8 +47,8 @@ def plot(rows: list[Row], path: Path, title: str) -> None:
 
 
 def _bars(axes: Axes, rows: list[Row]) -> None:
-    """Throughput of every way, grouped by part of the work."""
-    groups = [(part, pull) for pull in (False, True) for part in ("projection", "sampling", "both")]
+    """Plot the throughput of each implementation, grouped by the part of the lookup."""
+    groups = [(part, gradient) for gradient in (False, True) for part in ("projection", "sampling", "both")]
     for index, (name, (label, colour)) in enumerate(LABELS.items()):
         found = {(row["part"], row["gradient"]): row for row in rows if row["way"] == name}
         places = [place + 0.15 * (index - 2) for place, group in enumerate(groups) if group in found]
@@ -55,7 +57,7 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
             bars = axes.bar(places, values, 0.14, color=colour, label=label)
             axes.bar_label(bars, fmt="{:.3g}", fontsize=7)
     words = {"projection": "projection alone", "sampling": "sampling alone", "both": "projection and sampling"}
-    labels = [words[part] + ("\nforward and gradient" if pull else "\nforward") for part, pull in groups]
+    labels = [words[part] + ("\nforward and gradient" if gradient else "\nforward") for part, gradient in groups]
     axes.set_xticks(range(len(groups)), labels)
     planes, points, size = STANDARD
     axes.set_title(f"{planes} planes of {size} x {size} pixels, {points:,} points")
@@ -65,7 +67,7 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
 
 
 def _lines(axes: Axes, axis: str, rows: list[Row]) -> None:
-    """Time of every way as one number grows; ticks are the numbers measured, in full."""
+    """Plot the time of each implementation over one size; the ticks are the measured sizes, written in full."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     for name, (_, colour) in LABELS.items():

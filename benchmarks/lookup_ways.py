@@ -1,4 +1,4 @@
-"""What the lookup benchmark compares: a scene, the parts of the work, and every way of doing each."""
+"""What the lookup benchmark compares: a scene, the parts of a lookup, and the implementations of each part."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from hyperplanes.geometry.packed_images import PackedImages, pack
 
 __all__ = ["STANDARD", "Scene", "needed_bytes", "runs", "ways"]
 
-STANDARD = (25, 65_536, 200)  # planes, points, pixels a side
+STANDARD = (25, 65_536, 200)  # planes, points, pixels per side
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Cameras around a ball of random points, with random 8-bit pictures."""
+    """Cameras around a ball of random points, with random 8-bit images, also packed into 32 bits per pixel."""
 
     cameras: PinholeCamera
     images: Tensor
@@ -34,7 +34,7 @@ class Scene:
 
     @classmethod
     def make(cls, planes: int, points: int, size: int, device: str = "cpu") -> Scene:
-        """The same scene for the same numbers."""
+        """A scene; the same arguments give the same scene."""
         generator = torch.Generator().manual_seed(0)
         poses = camera.fibonacci_sphere(planes, 2.7)
         cameras = camera.to(camera.pinhole(camera.symmetric_intrinsics(size, size, 0.9), poses, size, size), device)
@@ -45,27 +45,28 @@ class Scene:
 
     @property
     def lookups(self) -> int:
-        """Points times planes."""
+        """The number of lookups: points times planes."""
         return len(self.points) * len(self.images)
 
     @property
     def singles(self) -> list[PinholeCamera]:
-        """Every camera by itself, as the loop needs them."""
+        """The cameras as separate batches of one, for the loop."""
         return [camera.select(self.cameras, [view]) for view in range(len(self.images))]
 
 
-Leaves = tuple[Tensor, ...]  # what gradients are asked for: points or coordinates, and images
+Leaves = tuple[Tensor, ...]  # tensors that gradients are computed for: points or coordinates, and images
 Way = Callable[..., tuple[Tensor, ...]]
 
 
 def ways(scene: Scene, part: str) -> tuple[Leaves, dict[str, Way]]:
-    """The inputs of one part of the work, and everything that can do it.
+    """The inputs of one part of a lookup, and its implementations.
 
     Args:
+        scene: cameras, images and points.
         part: "projection", "sampling" or "both".
 
     Returns:
-        Leaves, and functions of them by name; each returns all its results.
+        Leaves, and the implementations by name: functions of the leaves that return all their results.
     """
     height = width = scene.images.shape[-1]
     matrices = camera.projection_matrices(scene.cameras)
@@ -141,13 +142,19 @@ def _sampling_alone(grid: Tensor, images: Tensor, backend: str, packed: PackedIm
 
 
 def runs(leaves: Leaves, found: dict[str, Way], gradient: bool) -> dict[str, Callable[[], object]]:
-    """The ways as calls without arguments, with the pull-back of ones to points and images if asked for."""
+    """The implementations as calls without arguments.
+
+    Args:
+        leaves: their inputs.
+        found: the implementations by name.
+        gradient: also compute the gradients of the leaves, for output gradients of one.
+    """
     if not gradient:
         return {name: partial(_forward, way, leaves) for name, way in found.items()}
     live = tuple(leaf.detach().clone().requires_grad_() for leaf in leaves)
-    usable = {name: way for name, way in found.items() if name != "cpu_packed"}  # its images need no gradient
-    pulls = {name: [torch.ones_like(result) for result in way(*live)] for name, way in usable.items()}
-    return {name: partial(_forward_backward, way, live, pulls[name]) for name, way in usable.items()}
+    usable = {name: way for name, way in found.items() if name != "cpu_packed"}  # packed images have no gradient
+    ones = {name: [torch.ones_like(result) for result in way(*live)] for name, way in usable.items()}
+    return {name: partial(_forward_backward, way, live, ones[name]) for name, way in usable.items()}
 
 
 def _forward(way: Way, leaves: Leaves) -> tuple[Tensor, ...]:
@@ -155,16 +162,18 @@ def _forward(way: Way, leaves: Leaves) -> tuple[Tensor, ...]:
         return way(*leaves)
 
 
-def _forward_backward(way: Way, leaves: Leaves, pulls: list[Tensor]) -> tuple[Tensor | None, ...]:
-    return torch.autograd.grad(way(*leaves), leaves, pulls, allow_unused=True)
+def _forward_backward(way: Way, leaves: Leaves, grad_outputs: list[Tensor]) -> tuple[Tensor | None, ...]:
+    return torch.autograd.grad(way(*leaves), leaves, grad_outputs, allow_unused=True)
 
 
 def needed_bytes(scene: Scene, part: str, gradient: bool, way: str) -> int:
-    """What must be read and written at least once: points, planes, results; with a gradient theirs too.
+    """The bytes that must be read or written at least once: points, images, results and, if asked for, gradients.
 
     Args:
-        gradient: whether the pull-back is included.
-        way: packed pictures are a third of the size.
+        scene: cameras, images and points.
+        part: "projection", "sampling" or "both".
+        gradient: include the gradients.
+        way: the name of the implementation; packed images are a third of the size.
     """
     per_lookup = {"projection": 8 + 1, "sampling": 8 + 12, "both": 12 + 8 + 1}[part]
     planes = 0 if part == "projection" else scene.images.numel() * 4 // (3 if way == "cpu_packed" else 1)

@@ -1,4 +1,4 @@
-"""The objects that benchmarks of rendering and training look at."""
+"""The objects that benchmarks render and train on."""
 
 from __future__ import annotations
 
@@ -18,7 +18,18 @@ FIRST_SEED = 900_000
 def held_out(
     count: int, size: int, views: int = 50, device: torch.device | str = "cpu", kind: str = "car", *, first: int = 0
 ) -> list[Task]:
-    """Procedural objects never trained on, half of the views support and half query, on the fixed rig."""
+    """Procedural objects that are in no training data, rendered over white by the cameras of the fixed rig.
+
+    Every second view is a support view; the others are query views.
+
+    Args:
+        count: number of objects.
+        size: pixels per side.
+        views: number of views per object.
+        device: of the images.
+        kind: class of the objects.
+        first: how many objects to skip.
+    """
     rig = fixed(views, size)
     cameras = rig.cameras(dtype=torch.float32)
     tasks = []
@@ -26,7 +37,7 @@ def held_out(
     for seed in range(FIRST_SEED + first, FIRST_SEED + first + count):
         mesh = prepare_scene(make(kind, seed), f"{kind}-{seed}")
         pixels = torch.tensor(renderer.render(mesh_parts(mesh), rig).rgba).permute(0, 3, 1, 2)
-        pixels = pixels.contiguous().float() / 255  # as what is read from files
+        pixels = pixels.contiguous().float() / 255  # the memory layout of images that are read from files
         masks = pixels[:, 3:]
         seen = Views(pixels[:, :3] * masks + 1 - masks, cameras, masks).to(device)
         even = torch.arange(0, views, 2)

@@ -1,4 +1,4 @@
-"""Values of options that argparse checks."""
+"""Types of command-line options for argparse."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ __all__ = ["positive"]
 
 
 def positive(text: str) -> int:
-    """A whole number above 0, as the `type` of an option.
+    """Convert text to a whole number of at least 1; used as the `type` of an option.
 
     Raises:
-        ArgumentTypeError: another number, or none.
+        ArgumentTypeError: the text is not such a number.
     """
     try:
         number = int(text)

@@ -1,8 +1,9 @@
-"""Rendering by the default protocol against the paper's, with the same weights on the same held-out objects.
+"""Compare rendering by the default protocol with the paper's, with the same weights on the same held-out objects.
 
-The paper's protocol asks a coarse and a fine network at 64 + 192 places of every ray, by the same kernels and with the
-layers of its networks multiplied by PyTorch. The default one renders the same field where it is not empty. All run in
-turn, in one process; the objects are procedural cars with seeds that no training of this project uses.
+The paper's protocol evaluates a coarse and a fine network, at 64 and 192 samples per ray. It is measured twice: with
+the kernels of this package, and with the layers of its networks multiplied by PyTorch. The default protocol renders the
+same field only where it is not empty. All run alternately in one process. The objects are procedural cars with seeds
+that no training of this project uses.
 """
 
 from __future__ import annotations
@@ -42,23 +43,23 @@ __all__ = ["main"]
 CHECKPOINT = Path(__file__).parent / "weights" / "paper-network"
 PAPER = Hierarchical(64, 128)
 RAYS_OF_A_LARGE_VIEW = 8192
-VIEWS = {64: 3, 128: 3, 200: 2, 400: 1}  # how many of so many pixels a side
+VIEWS = {64: 3, 128: 3, 200: 2, 400: 1}  # pixels per side: number of views
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks rendering", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="64 pixels alone, about a minute")
+    parser.add_argument("--quick", action="store_true", help="64 pixels per side only, in about a minute")
     parser.add_argument(
         "--sizes",
         type=int,
         nargs="+",
         choices=VIEWS,
-        help="pixels of a side, and nothing else: all, and more, if absent",
+        help="pixels per side, and only these rows (default: all sizes, 50 views, and peak memory)",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="a trained model (default: %(default)s)")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the growth goes (PNG)")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="PNG file to plot the growth of the time to")
     add_device_option(parser, "cpu")
     parser.add_argument("--memory", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -85,16 +86,16 @@ def main(arguments: list[str]) -> int:
 
 @dataclass(frozen=True)
 class PaperView:
-    """One view by the paper's protocol.
+    """One view rendered by the paper's protocol.
 
-    Of a picture with many rays an even subset is rendered and the time scaled.
+    If the view has many rays, an evenly spaced subset is rendered, and the time is scaled.
 
     Attributes:
-        seconds: of the whole view.
-        samples: a ray.
-        error: squared, over the rays of the subset.
-        chosen: these rays' pixels.
-        truth: their colours.
+        seconds: for the whole view.
+        samples: per ray.
+        error: mean squared error over the rendered rays.
+        chosen: flat pixel indices of the rendered rays.
+        truth: true colours of these pixels.
     """
 
     seconds: float
@@ -105,7 +106,7 @@ class PaperView:
 
     @classmethod
     def of(cls, adapted: AdaptedField, query: Views, view: int) -> PaperView:
-        """Render a view, or some rays of it."""
+        """Render a view, or a subset of its rays."""
         height, width = query.size
         total = height * width
         chosen = torch.arange(0, total, max(1, total // RAYS_OF_A_LARGE_VIEW) if total > 128 * 128 else 1)
@@ -119,7 +120,7 @@ class PaperView:
         return cls(seconds * total / len(chosen), seen.samples / len(chosen), error, chosen, truth)
 
     def error_of(self, pictures: Pictures) -> float:
-        """The squared error of another rendering of the view, over the same rays."""
+        """The mean squared error of another rendering of the view, over the same rays."""
         return float((pictures.images[0].flatten(1).T[self.chosen] - self.truth).square().mean())
 
 
@@ -128,11 +129,14 @@ PROTOCOLS = {
     "one ray a pixel": {"antialias": False},
     "one ray a pixel in single precision": {"antialias": False, "mixed_precision": False},
 }
-"""Ours by name, and options of `AdaptedField.render`; the paper's has one ray a pixel, in single precision."""
+"""Variants of the default protocol, as options of `AdaptedField.render`.
+
+The paper's protocol uses one ray per pixel, in single precision.
+"""
 
 
 def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
-    """One view of each object by all protocols: ours, the paper's, ours again."""
+    """Render one view of each object by all protocols; the default protocol before and after the paper's."""
     found: dict[str, list[dict[str, float]]] = {name: [] for name in PROTOCOLS}
     for number, task in enumerate(tasks):
         view = (7 * number + 3) % len(task.query)
@@ -144,7 +148,7 @@ def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
         def ours(name: str, adapted: AdaptedField = adapted, one: PinholeCamera = one) -> tuple[float, Pictures]:
             return timed(lambda: adapted.render(one, **PROTOCOLS[name]))
 
-        if number == 0:  # compiles
+        if number == 0:  # compiles kernels before the measurement
             for name in PROTOCOLS:
                 ours(name)
         before = {name: ours(name) for name in PROTOCOLS}
@@ -161,7 +165,7 @@ def compare(model: HyperPlanes, tasks: list[Task]) -> list[Row]:
 
 
 def _summary(name: str, size: int, rows: list[dict[str, float]]) -> Row:
-    """One row of several views."""
+    """One row for the results of several views."""
     ratios, plainly = ([row[name] / row["seconds"] for row in rows] for name in ("reference_seconds", "plain_seconds"))
     ours, paper = (statistics.fmean(_decibels(row[error]) for row in rows) for error in ("error", "reference_error"))
     median = {
@@ -188,7 +192,7 @@ def _decibels(error: float) -> float:
 
 
 def fifty_views(model: HyperPlanes, task: Task) -> Row:
-    """Seconds from support views to fifty pictures by the default protocol."""
+    """The seconds to adapt to the support views and to render the views of all cameras by the default protocol."""
     cameras = camera.concatenate([task.support.cameras, task.query.cameras])
     seconds, _ = timed(lambda: model.adapt(task.support).render(cameras))
     size = task.query.size[0]
@@ -196,7 +200,7 @@ def fifty_views(model: HyperPlanes, task: Task) -> Row:
 
 
 def parts(model: HyperPlanes, task: Task) -> list[Row]:
-    """Where the time of the default protocol goes, each part on the samples that one view asks for."""
+    """The shares of sampling, lookup, network and compositing in the time of one view by the default protocol."""
     adapted = model.adapt(task.support)
     occupancy, query = adapted.refined_occupancy, task.query
     field, sampling = adapted.field, adapted.sampling
@@ -232,13 +236,13 @@ def parts(model: HyperPlanes, task: Task) -> list[Row]:
 
 
 def baked(model: HyperPlanes, task: Task) -> list[Row]:
-    """The baked form against the field it was made from: speed and what it costs."""
+    """Compare baked voxels with the field that they were baked from: speed and PSNR."""
     adapted = model.adapt(task.support)
     query = task.query[::8]
     _ = adapted.refined_occupancy
     baking, field = timed(lambda: bake(adapted))
     scene = BakedScene(field)
-    scene.render(camera.select(query.cameras, [0]))  # compiles
+    scene.render(camera.select(query.cameras, [0]))  # compiles kernels before the measurement
     slow, fast = [], []
     pictures: list[Pictures] = []
     for _ in range(2):
@@ -277,7 +281,7 @@ def peak_memory(checkpoint: Path, device: str) -> Row:
 
 
 def large_view(model: HyperPlanes) -> int:
-    """What the process of `peak_memory` does: prints its seconds and its peak in GiB."""
+    """The work of the process that `peak_memory` starts: prints its seconds and its peak memory in GiB."""
     task = held_out(1, 200)[0]
     one = camera.resized(camera.select(task.query.cameras, [3]), 800, 800)
     seconds, _ = timed(lambda: model.adapt(task.support).render(one))
@@ -286,9 +290,9 @@ def large_view(model: HyperPlanes) -> int:
 
 
 def resident_peak() -> int:
-    """The most bytes that this process held in memory so far.
+    """The peak resident memory of this process so far, in bytes.
 
-    The system's own count begins with what the process held that started this one, so Linux is asked otherwise.
+    On Linux it is read from /proc, because `getrusage` includes the memory of the parent process at the fork.
     """
     status = Path("/proc/self/status")
     if status.exists():

@@ -1,4 +1,4 @@
-"""How the time of one view grows with pixels, samples and planes, by the default protocol."""
+"""The time of one view by the default protocol, as a function of pixels, samples and planes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,14 @@ __all__ = ["growth", "plot_growth"]
 
 
 def growth(model: HyperPlanes, quick: bool) -> list[Row]:
-    """Seconds of one view as pixels, samples a ray and planes grow, each from 128x128, 96 steps, 25 planes.
+    """Seconds of one view for other numbers of pixels, of samples per ray and of planes than 128x128, 96 and 25.
 
-    Networks of another number of planes than the model's are not trained: their pictures mean nothing, but every
-    sample costs what it costs.
+    The networks for other numbers of planes are not trained. Their pictures are meaningless, but the cost of a sample
+    is that of a trained network.
+
+    Args:
+        model: the model.
+        quick: measure each setting once, not three times.
     """
     rows: list[Row] = []
     sizes, steps, counts = (32, 64, 128, 256, 512), (24, 48, 96, 192, 384), (1, 5, 10, 25, 50, 100)
@@ -58,7 +62,7 @@ def growth(model: HyperPlanes, quick: bool) -> list[Row]:
 
 
 def plot_growth(rows: list[Row], path: Path) -> None:
-    """Seconds of one view along each axis of `growth`, with a line of the slope that the samples asked for explain."""
+    """Plot the rows of `growth`, with a line for the time that is proportional to the number of samples."""
     figure = new_figure(11, 3.6)
     axes = figure.subplots(1, 3, sharey=True)
     labels = {"pixels": "pixels a side", "steps": "steps along the diameter", "planes": "ImagePlanes"}

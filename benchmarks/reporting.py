@@ -1,4 +1,4 @@
-"""What every benchmark prints and writes: rows, the commit and the hardware they were measured on."""
+"""The output of every benchmark: rows, with the commit and the hardware that they were measured on."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ Row = dict[str, str | float | int]
 
 
 def finish(name: str, rows: list[Row], json_file: Path | None, device: str = "cpu") -> int:
-    """Print the rows, one a line, and write them with their environment where asked.
+    """Print the rows, one per line, and write them with their environment if a file is given.
 
     Args:
-        rows: what was measured; each has a "name".
+        name: of the benchmark.
+        rows: the results; each has a "name".
+        json_file: the file to write.
+        device: of the measurement.
 
     Returns:
         The exit code, 0.
@@ -32,7 +35,7 @@ def finish(name: str, rows: list[Row], json_file: Path | None, device: str = "cp
 
 
 def write_rows(name: str, rows: list[Row], json_file: Path, device: str = "cpu", **about: object) -> None:
-    """Write rows with the commit and the hardware, and what else is to be known about them."""
+    """Write rows with the commit, the hardware, the load, and further entries."""
     machine = environment() | {"load": round(load_at_start(), 2)}
     content = {"benchmark": name, "device": device, **machine, **about, "rows": rows}
     write_whole(json_file, (json.dumps(content, indent=2) + "\n").encode())

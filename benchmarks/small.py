@@ -1,13 +1,13 @@
-"""Views by the packaged model `small`, as they are rendered, against every sample in plain PyTorch.
+"""Compare rendering by the packaged model `small` with plain PyTorch that evaluates every sample.
 
     python -m benchmarks small --json FILE
     python -m benchmarks small --scene ../shared/posed/chair --views 50
 
-Of a procedural car that no training saw, or of a posed scene: the time to a field with its voxels and its surface, a
-view at several sizes, and PSNR. The reference is the same field, whose
-inputs PyTorch looks up, gathers and concatenates, whose layers it multiplies, and which is asked for the colour of
-every sample in every voxel of the visual hull that is not empty and in those around them, until rays are as opaque as
-in training. Both run in turn, in one process, and all views once more with PyTorch's layers alone.
+The object is a held-out procedural car, or a posed scene. Measured are the time to adapt, the time of a view at several
+sizes, and PSNR. The reference is the same field in PyTorch, which looks up and concatenates the inputs of the network
+and multiplies its layers. It computes the colour of every sample in every voxel of the visual hull that is not empty
+and in the voxels around them, until rays are as opaque as in training. Both run alternately in one process. The views
+are also rendered with only the layers multiplied by PyTorch, and in single precision.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ __all__ = ["main"]
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks small", description=__doc__)
-    parser.add_argument("--sizes", type=positive, nargs="+", default=[128, 400], help="pixels a side of the car")
-    parser.add_argument("--scene", type=Path, help="a posed scene in place of the car")
-    parser.add_argument("--views", type=positive, default=25, help="that are shown (default: %(default)s)")
-    parser.add_argument("--repeats", type=positive, default=5, help="views of each (default: %(default)s)")
+    parser.add_argument("--sizes", type=positive, nargs="+", default=[128, 400], help="pixels per side of the car")
+    parser.add_argument("--scene", type=Path, help="a posed scene instead of the car")
+    parser.add_argument("--views", type=positive, default=25, help="number of support views (default: %(default)s)")
+    parser.add_argument("--repeats", type=positive, default=5, help="number of query views (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="a car of 64 pixels, two views")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     sizes, repeats = ([64], 2) if chosen.quick else (chosen.sizes, chosen.repeats)
     model = HyperPlanes.from_pretrained("small")
@@ -64,12 +64,12 @@ def main(arguments: list[str]) -> int:
 
 
 def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
-    """One object: ours and the reference in turn, view by view."""
-    model.adapt(task.support)  # compiles, and fills caches
+    """Measure one object; for each view, the default and the reference in turn."""
+    model.adapt(task.support)  # compiles kernels and fills caches before the measurement
     adapt, adapted = timed(lambda: model.adapt(task.support))
     adapted = adapted.without_residuals()
     with _plainly():
-        adapted(*2 * (adapted.occupancy.centres()[:1],))  # compiles
+        adapted(*2 * (adapted.occupancy.centres()[:1],))  # compiles kernels before the measurement
         voxels = refine_voxels(adapted.occupancy, adapted.density)
     assert isinstance(adapted.sampling, RayMarching)
     every = RayMarching(adapted.sampling.steps * 5 // 3, adapted.sampling.stop)
@@ -109,13 +109,13 @@ def measure(model: HyperPlanes, task: Task, repeats: int) -> Row:
 
 
 def _multiplied(adapted: AdaptedField, cameras: PinholeCamera) -> Pictures:
-    """The views, by layers that PyTorch multiplies."""
+    """Render the views with layers that PyTorch multiplies."""
     with without(PackedLayers, "takes"):
         return adapted.render(cameras)
 
 
 def _shown(task: Task, count: int) -> Task:
-    """The task of which so many views are shown, as far apart in their order as that allows."""
+    """The task with `count` of its support views, evenly spaced in their order."""
     return replace(task, support=task.support[:: max(1, len(task.support) // count)][:count])
 
 
@@ -124,13 +124,13 @@ def _quality(pictures: Pictures, task: Task, views: list[int]) -> list[float]:
 
 
 def _unsplit(adapted: AdaptedField, voxels: RefinedOccupancy) -> AdaptedField:
-    """The same field as a mere function, all of whose colours are evaluated, and of whose voxels none is trimmed."""
+    """The same field as a plain function, so that the colours of all samples are computed in all these voxels."""
     field: Callable = adapted.field
     return replace(adapted, field=lambda points, directions: field(points, directions), refined=voxels)
 
 
 @contextmanager
 def _plainly() -> Generator[None]:
-    """While it lasts, no kernel describes points to the network, and none multiplies its layers."""
+    """While active, no kernel computes the inputs of the network, and none multiplies its layers."""
     with without(VisibilityPlanes, "can_describe"), without(PackedLayers, "takes"):
         yield

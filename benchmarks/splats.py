@@ -1,11 +1,11 @@
-"""Gaussian splats against the baked voxels that they are made of: quality on views that were not shown, and time.
+"""Compare Gaussian splats with the baked voxels that they are made from: PSNR on query views, and time.
 
     python -m benchmarks splats --json FILE
     python -m benchmarks splats --scene ../shared/posed/chair
 
-Of procedural objects that no training saw, or of a posed scene: `small` adapts to 25 views, its field is baked, the
-voxels are fitted, and splats are made of them and fitted, as `hyperplanes export --what splats` does. Half of the views
-are shown, eight of the others are compared.
+The objects are held-out procedural objects, or a posed scene. `small` adapts to the support views, 25 for procedural
+objects. Its field is baked, the voxels are fitted, and splats are made from them and fitted, as in `hyperplanes export
+--what splats`. Up to eight query views are compared.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from hyperplanes.views import Task
 
 __all__ = ["main"]
 
-COMPARED = 8  # views
+COMPARED = 8  # query views
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks splats", description=__doc__)
     parser.add_argument("--objects", nargs="+", default=["car", "chair"], help="classes (default: car chair)")
-    parser.add_argument("--sizes", type=positive, nargs="+", default=[100], help="pixels a side (default: 100)")
-    parser.add_argument("--scene", type=Path, help="a posed scene in their place")
-    parser.add_argument("--quick", action="store_true", help="a car of 48 pixels, few steps")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--sizes", type=positive, nargs="+", default=[100], help="pixels per side (default: 100)")
+    parser.add_argument("--scene", type=Path, help="a posed scene instead of these objects")
+    parser.add_argument("--quick", action="store_true", help="a car of 48 pixels and few steps")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     model = HyperPlanes.from_pretrained("small")
     if chosen.quick:
@@ -53,11 +53,11 @@ def main(arguments: list[str]) -> int:
 
 
 def measure(model: HyperPlanes, task: Task, voxel_steps: int = STEPS, splat_steps: int = 160) -> Row:
-    """One object as a field, as voxels and as splats."""
+    """Measure one object as a field, as voxels and as splats."""
     shown, asked = task.support, task.query[:COMPARED]
     field = model.adapt(shown).without_residuals()
     baked = bake(field, side=default_side(shown.size))
-    fit_splats(splats_of(baked), shown, steps=1)  # compiles
+    fit_splats(splats_of(baked), shown, steps=1)  # compiles kernels before the measurement
     voxel_seconds, baked = timed(lambda: fit_voxels(baked, shown, steps=voxel_steps))
     splat_seconds, splats = timed(lambda: fit_splats(splats_of(baked), shown, steps=splat_steps))
     scene = BakedScene(baked)

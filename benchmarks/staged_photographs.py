@@ -1,7 +1,8 @@
-"""Photographs of an object on a table in a textured room, taken with a lens, exposures, blur and noise that are known.
+"""Simulated photographs of an object on a table in a textured room, with known lens, exposures, blur and noise.
 
-The world has y up and the object within the unit sphere around the origin. The room and the table are analytic; the
-object is either an ellipsoid, analytic too, or any mesh, drawn by `data_gen` and laid over the room.
+The y axis of the world points up, and the object lies within the unit sphere around the origin. The room and the table
+are analytic. The object is an analytic ellipsoid, or a mesh that `data_gen` renders and that is composited over the
+room.
 """
 
 from __future__ import annotations
@@ -25,25 +26,25 @@ __all__ = ["Staged", "stage", "walk_around"]
 
 Array = Float[np.ndarray, "..."]
 
-HALF_ROOM = 6.0  # from the origin to its walls
-AXES = np.array([0.75, 0.55, 0.5])  # of the ellipsoid
-LIGHT = np.array([0.4, 0.8, 0.45])
-FOCAL = 1.15  # focal length in units of the longer side
+HALF_ROOM = 6.0  # distance from the origin to the walls of the room
+AXES = np.array([0.75, 0.55, 0.5])  # semi-axes of the ellipsoid
+LIGHT = np.array([0.4, 0.8, 0.45])  # direction towards the light
+FOCAL = 1.15  # focal length as a multiple of the longer side
 EXPOSURE = 0.12  # standard deviation of the logarithm of each photograph's brightness
 BLUR = 0.5  # largest standard deviation of a photograph's blur, in pixels
-NOISE = 0.01  # standard deviation of the noise of a grey pixel, of 1
+NOISE = 0.01  # standard deviation of the noise of a grey pixel, for values in [0, 1]
 
 
 @dataclass(frozen=True)
 class Staged:
-    """Photographs and what is true of them.
+    """Simulated photographs with their true masks and cameras.
 
     Attributes:
-        photographs: (height, width, 3) each, as a camera would have saved them.
-        masks: (height, width) each, true where the object is, through the same lens.
+        photographs: (height, width, 3) each, distorted as a camera saves them.
+        masks: (height, width) each, distorted likewise; true where the object is.
         world_from_camera: (view, 4, 4), OpenCV axes.
-        calibration: (3, 3), integer pixel centres.
-        lens: k1 and k2.
+        calibration: (3, 3) intrinsics, integer pixel centres.
+        lens: the distortion coefficients k1 and k2.
     """
 
     photographs: list[UInt8[np.ndarray, "height width 3"]]
@@ -62,11 +63,11 @@ class Staged:
 def walk_around(
     count: int, seed: int, heights: tuple[float, ...] = (12.0, 35.0, 58.0)
 ) -> Float[np.ndarray, "view 4 4"]:
-    """Poses of somebody who walks around the object once for each height, holding the camera almost level.
+    """Poses of a hand-held camera that goes around the object once at each elevation, almost level.
 
     Args:
-        count: of poses in all.
-        seed: of what no hand holds still.
+        count: total number of poses.
+        seed: of the random deviations from the circles.
         heights: elevations of the rounds, in degrees.
 
     Returns:
@@ -105,16 +106,16 @@ def stage(
     samples: int = 2,
     octaves: int = 6,
 ) -> Staged:
-    """Take the photographs.
+    """Render the photographs.
 
     Args:
         poses: world_from_camera, OpenCV axes.
         size: (height, width) in pixels.
         seed: of textures, exposures, blur and noise.
-        mesh: the object; an ellipsoid when None.
-        lens: k1 and k2 of the camera.
-        samples: along a side of a pixel, of the room and the ellipsoid.
-        octaves: of the noise that room and table are painted with; fewer leave out the finest details.
+        mesh: the object; None for an ellipsoid.
+        lens: the distortion coefficients k1 and k2.
+        samples: samples per pixel along each axis, for the room and the ellipsoid.
+        octaves: octaves of the noise texture; fewer octaves have fewer fine details.
     """
     generator = np.random.default_rng(seed)
     texture = generator.random((32, 32, 32, 3)).astype(np.float32)
@@ -145,7 +146,7 @@ def stage(
 def _drawn(
     mesh: Mesh | None, poses: Array, calibration: Array, size: tuple[int, int]
 ) -> tuple[np.ndarray | None, float]:
-    """RGBA of the mesh through a pinhole, premultiplied, and the height of the table under it."""
+    """Premultiplied RGBA images of the mesh by pinhole cameras (None for an ellipsoid), and the height of the table."""
     if mesh is None:
         return None, -float(AXES[1])
     rig = Rig(poses, calibration, size[1], size[0], near=0.5, far=8.0)
@@ -158,7 +159,10 @@ def _drawn(
 
 
 def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float, octaves: int) -> tuple[Array, Array]:
-    """Colour and coverage by the ellipsoid, the mean of the samples (row, sample, column, sample, 2) a pixel."""
+    """The colour of each pixel and its coverage by the ellipsoid, as the mean over samples.
+
+    `slopes` are the slopes of the rays of all samples, (row, sample, column, sample, 2).
+    """
     shape, slopes = slopes.shape[:4], slopes.reshape(-1, 2)
     ways = np.concatenate([slopes, np.ones_like(slopes[:, :1])], -1) @ pose[:3, :3].T
     eye = pose[:3, 3]
@@ -188,7 +192,7 @@ def _seen(pose: Array, slopes: Array, texture: Array, ball: bool, floor: float, 
 
 
 def _texture(points: Array, table: Array, frequency: float, octaves: int) -> Array:
-    """Colours from noise of some octaves, trilinear between the entries of a table that repeats."""
+    """Colours at points from noise of several octaves, interpolated trilinearly in a periodic table."""
     side = len(table)
     repeated = np.pad(table, ((0, 1), (0, 1), (0, 1), (0, 0)), mode="wrap") - 0.5
     volume = torch.from_numpy(repeated).permute(3, 2, 1, 0)[None]  # (1, 3, z, y, x)
@@ -201,7 +205,7 @@ def _texture(points: Array, table: Array, frequency: float, octaves: int) -> Arr
 
 
 def _without_lens(slopes: Array, lens: tuple[float, float]) -> Array:
-    """Slopes of the rays through distorted ones."""
+    """Undistorted slopes of rays, from distorted ones."""
     if not any(lens):
         return slopes
     coefficients = torch.tensor([[*lens, 0, 0, 0, 0, 0, 0]], dtype=torch.float64)
@@ -211,7 +215,7 @@ def _without_lens(slopes: Array, lens: tuple[float, float]) -> Array:
 
 
 def _lens_source(size: tuple[int, int], calibration: Array, lens: tuple[float, float]) -> Array:
-    """Where a pinhole shows what the lens shows in each pixel, (row, column)."""
+    """For each pixel of the distorted image, its position (row, column) in the pinhole image."""
     rows, columns = np.mgrid[: size[0], : size[1]]
     pixels = np.stack([columns, rows], -1).reshape(-1, 2)
     focal, centre = calibration[[0, 1], [0, 1]], calibration[:2, 2]
@@ -219,6 +223,6 @@ def _lens_source(size: tuple[int, int], calibration: Array, lens: tuple[float, f
 
 
 def _through_lens(picture: Array, source: Array) -> Array:
-    """A pinhole's picture as the lens shows it."""
+    """A pinhole image, distorted by the lens."""
     channels = [ndimage.map_coordinates(channel, source.T, order=1) for channel in np.moveaxis(picture, -1, 0)]
     return np.stack(channels, -1).reshape(picture.shape)

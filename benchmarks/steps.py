@@ -1,10 +1,10 @@
-"""Steps of training of the preset `small` on a data set, and where their time goes.
+"""Measure training steps of the preset `small` on a data set, and the parts of their time.
 
     python -m benchmarks steps --data data/cars --json FILE
 
-Steps of the packaged weights in turn: as they are taken, in single precision alone, and the reference, in single
-precision, which differentiates every sample that lies in the hull and convolves by PyTorch's modules. All take the same
-episodes. Beside them, what it takes to make one episode ready whose pictures are in memory.
+Steps are taken alternately by default, in single precision, and by the reference. The reference uses single precision,
+computes gradients for every sample in the hull, and convolves with PyTorch's modules. All start from the packaged
+weights and use the same episodes. Also measured is the time to prepare an episode whose images are in memory.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from hyperplanes.views import Tasks
 
 __all__ = ["main"]
 
-RATE = 1e-6  # so small that the weights stay what they are, and the work with them
+RATE = 1e-6  # so small that the weights, and with them the work of a step, do not change
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks steps", description=__doc__)
-    parser.add_argument("--data", type=Path, help="a data set; procedural cars where absent")
-    parser.add_argument("--untrained", action="store_true", help="begin with first weights, not the packaged ones")
-    parser.add_argument("--repeats", type=positive, default=12, help="steps of each (default: %(default)s)")
-    parser.add_argument("--threads", type=int, default=1, help="that take a step (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="two objects, one step of each")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--data", type=Path, help="a data set (default: procedural cars)")
+    parser.add_argument("--untrained", action="store_true", help="start from initial weights, not the packaged ones")
+    parser.add_argument("--repeats", type=positive, default=12, help="steps of each kind (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="number of threads (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="small images, one step of each kind")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     if chosen.threads < 1:
         parser.error(f"--threads: expected at least 1, got {chosen.threads}")
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _measured(chosen: argparse.Namespace) -> list[Row]:
-    """Steps of each way, their parts, and making an episode ready."""
+    """Rows for the steps of each kind, for their parts, and for preparing an episode."""
     size, views, repeats = (64, 8, 1) if chosen.quick else (128, 50, chosen.repeats)
     data: Tasks = Objects(held_out(4, size, views)) if chosen.data is None else open_dataset(chosen.data)
     ways = {
@@ -82,7 +82,7 @@ def _measured(chosen: argparse.Namespace) -> list[Row]:
 
 
 def _trainer(data: Tasks, stop: float, precision: str, untrained: bool) -> Trainer:
-    """A training that stays where it is; `stop` 0 differentiates every sample."""
+    """A trainer whose weights hardly change; with `stop` 0, every sample has a gradient."""
     settings = preset("small")
     model = HyperPlanes(settings.model) if untrained else HyperPlanes.from_pretrained("small")
     model.config = replace(model.config, sampling=replace(settings.model.sampling, stop=stop))
@@ -91,7 +91,7 @@ def _trainer(data: Tasks, stop: float, precision: str, untrained: bool) -> Train
 
 
 def _compare(trainers: dict[str, Trainer], repeats: int) -> list[Row]:
-    """Seconds of a step of each, in turn, and of its parts."""
+    """Rows for the seconds of a step of each trainer, measured alternately, and of the parts of a step."""
     ours, single, reference = trainers.values()
 
     def plain_step() -> None:
@@ -113,7 +113,7 @@ def _compare(trainers: dict[str, Trainer], repeats: int) -> list[Row]:
 
 @contextmanager
 def _plainly() -> Generator[None]:
-    """The time in which the U-Net convolves by PyTorch's modules alone."""
+    """While active, the U-Net convolves with PyTorch's modules alone."""
 
     def pointwise(layer: nn.Conv3d, *inputs: Tensor) -> Tensor:
         return conv3d(torch.cat(inputs, 1), layer.weight, layer.bias)

@@ -1,9 +1,9 @@
-"""Write the tables of benchmarks into the pages that show them, from the rows in benchmarks/results.
+"""Write the tables of the documentation from the rows in benchmarks/results.
 
     python -m benchmarks tables
 
-A table stands between `<!-- benchmarks NAME -->` and `<!-- end -->`, with the processor, the commit and the load that
-its rows were measured with below it. `python -m benchmarks all` ends with this.
+Each table is between `<!-- benchmarks NAME -->` and `<!-- end -->`. Below it are the processor, the commit and the load
+of the measurement. `python -m benchmarks all` also writes the tables.
 """
 
 from __future__ import annotations
@@ -28,27 +28,30 @@ MARKED = re.compile(r"(<!-- benchmarks (\w+) -->\n).*?(<!-- end -->)", re.DOTALL
 
 
 def main(arguments: list[str]) -> int:
-    """Fill the tables of all pages."""
+    """Write the tables of all pages."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks tables", description=__doc__)
-    parser.add_argument("--results", type=Path, default=RESULTS, help="where the rows are (default: %(default)s)")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder with the rows (default: %(default)s)")
     chosen = parser.parse_args(arguments)
     for page in PAGES:
         before = page.read_text(encoding="utf-8")
         if (after := fill(before, chosen.results, page)) != before:
             write_whole(page, after.encode())
-            print(f"benchmarks tables: {page.relative_to(ROOT)} is written anew")
+            print(f"benchmarks tables: wrote {page.relative_to(ROOT)}")
     return 0
 
 
 def fill(text: str, results: Path = RESULTS, page: Path | str = "page") -> str:
-    """A page with its tables as the results have them.
+    """Fill the tables of a page from results.
+
+    A table that no benchmark makes, or whose rows are missing, is a DataError.
 
     Args:
-        results: the folder of the results, NAME.json.
-        page: its name, for messages.
+        text: the text of the page.
+        results: folder with the results, NAME.json.
+        page: name of the page, for messages.
 
     Returns:
-        The page. A table that no benchmark makes, or whose rows are not there, is a DataError.
+        The text with the new tables.
     """
 
     def replaced(found: re.Match[str]) -> str:
@@ -56,7 +59,7 @@ def fill(text: str, results: Path = RESULTS, page: Path | str = "page") -> str:
         if name not in TABLES:
             raise DataError(f"{page}: expected a table of {', '.join(TABLES)}, found {name}; correct its marker")
         made = {each: _read(results / f"{each}.json", page) for each in SOURCES.get(name, (name,))}
-        origins: dict[str, list[str]] = {}  # what rows depend on: in which files those are that do
+        origins: dict[str, list[str]] = {}  # by description of the measurement, the files that have it
         for source, result in made.items():
             origins.setdefault(_measured(result), []).append(f"{source}.json")
         whose = [origin + f" ({', '.join(files)})" * (len(origins) > 1) for origin, files in origins.items()]
@@ -73,7 +76,7 @@ def _read(path: Path, page: Path | str) -> Result:
 
 
 def _measured(result: Result) -> str:
-    """What the rows depend on beside the command: those of quality on the commit alone."""
+    """How the rows were measured: commits for rows of quality; also the machine and its load for rows of speed."""
     if result["benchmark"] in OF_QUALITY:
         commits = dict.fromkeys([result["commit"], *(row["commit"] for row in result["rows"] if "commit" in row)])
         return f"Commit {', '.join(commits)}"
@@ -136,7 +139,7 @@ def _lookup(result: Result) -> str:
     lines = []
     for part, gradient in dict.fromkeys((row["part"], row["gradient"]) for row in rows):
         ways: Result = {}
-        for row in rows:  # the first of each: later ones are of the growth with each size
+        for row in rows:  # the first row of each; later ones belong to the sweeps
             if (row["part"], row["gradient"]) == (part, gradient):
                 ways.setdefault(row["way"], row)
         ours = next(ways[way] for way in ("cpu_packed", "cpu", "triton", "torch") if way in ways)
@@ -222,7 +225,7 @@ PARTS = {
     "gradients": "backward, of both",
     "optimisers": "the optimisers",
 }
-"""Of a step of training, by the names of the profiler's marks."""
+"""The parts of a training step, by the names of the profiler's events."""
 
 
 def _steps(result: Result) -> str:
@@ -265,7 +268,7 @@ def _captures(result: Result) -> str:
     for row in result["rows"]:
         found = [f"{row['posed']} of {row['views']}", f"{row['within_half_degree_1_percent']:.0%}"]
         scores = [row.get(name) for name in ("psnr_true", "psnr", "psnr_loss", "psnr_nearest")]
-        quality = ["-" if score is None else f"{score:.2f} dB" for score in scores]  # where a part was not measured
+        quality = ["-" if score is None else f"{score:.2f} dB" for score in scores]  # None: not measured
         lines.append([row["name"], *found, f"{row['mask_iou']:.3f}", *quality])
     headings = ["posed", "right poses", "masks", "true poses and masks", "as found", "lost", "nearest photograph"]
     return markdown_table(["", *headings], lines)
@@ -278,7 +281,7 @@ WAYS = {
     "learned_background": "no masks, learned background",
     "no_masks": "no masks",
 }
-"""What else photographs are shown with, by the names in rows of captures."""
+"""Other masks that the quality is measured with, by the names in rows of captures."""
 
 
 def _captures_masks(result: Result) -> str:
@@ -298,7 +301,7 @@ VARIANTS = {
     "without_blending": "colours by the network alone, not blended",
     "random_start": "first weights at random, not those of the hull",
 }
-"""What is changed, by the names in rows of image_based."""
+"""What each variant changes, by the names in rows of image_based."""
 
 
 def _image_based(result: Result) -> str:
@@ -322,7 +325,7 @@ SOURCES = {
     "views_tuned": ("views_tuned", "views_tuned_posed"),
     "views_summary": OF_VIEWS,
 }
-"""Files of rows of tables that are not made of the file of their name."""
+"""The results that a table is made from, if not from the one of its own name."""
 TABLES: dict[str, Callable[..., str]] = {
     "adapting": _adapting,
     "baked": _baked,
@@ -349,4 +352,4 @@ TABLES: dict[str, Callable[..., str]] = {
     "views_residuals": views_residuals,
     "views_tuned": views_tuned,
 }
-"""What makes the table of each benchmark of its rows."""
+"""For each table, the function that makes it from results."""

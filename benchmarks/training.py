@@ -1,9 +1,10 @@
-"""Training by packed rays against the dense path of the paper: rays a second, parts of a step, memory, and the curves.
+"""Compare training with packed samples and the paper's dense training: rays per second, parts of a step, and memory.
 
-Both train the same network from the same start on the same objects with the same number of rays a step. The dense path
-draws its rays from whole query images and asks a coarse and a fine network at 64 + 192 places of each; the packed one
-draws them where the visual hull of the support masks can be seen and asks where it leaves something to be seen. With
-`--curves` both train the paper's networks for so many steps, looked at alike on objects that neither saw.
+Both train the same network from the same initial weights on the same objects, with the same number of rays per step.
+Dense training draws rays from whole query images, and evaluates a coarse and a fine network at 64 and 192 samples per
+ray. Packed training draws rays that hit the visual hull of the support masks, and evaluates samples in this hull. With
+`--curves STEPS`, both instead train the paper's networks for this number of steps, and are evaluated in the same way on
+held-out objects.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ __all__ = ["main"]
 
 DENSE = Hierarchical(64, 128)
 RAYS = 512
-UNSEEN = 2  # objects that are not trained on
+UNSEEN = 2  # number of held-out objects
 
 
 class Objects:
-    """Tasks in memory, the last ones held out."""
+    """Tasks in memory; the last UNSEEN by name are held out."""
 
     def __init__(self, tasks: list[Task]) -> None:
         self.tasks = {task.name: task for task in tasks}
 
     def names(self, split: str) -> list[str]:
-        """The objects of a split."""
+        """The names of the objects of a split, "train" or "test"."""
         names = sorted(self.tasks)
         return names[-UNSEEN:] if split == "test" else names[:-UNSEEN]
 
@@ -50,12 +51,12 @@ class Objects:
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks training", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="the quick preset alone, few steps")
-    parser.add_argument("--curves", type=int, metavar="STEPS", help="train both this far instead, which takes long")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="where a picture of the curves goes (PNG)")
+    parser.add_argument("--quick", action="store_true", help="only the preset quick, few steps")
+    parser.add_argument("--curves", type=int, metavar="STEPS", help="instead train both for STEPS steps (slow)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="PNG file to plot the curves to")
     add_device_option(parser, "cpu")
     options = parser.parse_args(arguments)
     rows: list[Row] = []
@@ -73,7 +74,7 @@ def main(arguments: list[str]) -> int:
 
 
 def both(chosen: Preset, objects: Objects) -> dict[str, Trainer]:
-    """A training by each path, always from the same weights, with everything about its objects ready."""
+    """A trainer for each kind of training, with the same initial weights and with all objects prepared."""
     device, trainers = objects.task(objects.names("test")[0]).support.images.device, {}
     for path, sampling in (("packed", chosen.model.sampling), ("dense", DENSE)):
         model = HyperPlanes(replace(chosen.model, sampling=sampling)).to(device)
@@ -86,7 +87,7 @@ def both(chosen: Preset, objects: Objects) -> dict[str, Trainer]:
 
 
 def compare(name: str, chosen: Preset, objects: Objects, steps: int, device: str) -> list[Row]:
-    """Rays a second and memory of both paths in turn, and on a CPU the parts of a step."""
+    """Rows for rays per second and memory of both, measured alternately, and on a CPU for the parts of a step."""
     trainers = both(chosen, objects)
     times = interleaved({path: each.take_step for path, each in trainers.items()}, steps, seconds=120)
     row: Row = {"name": f"packed training, {name}, {RAYS} rays a step"}
@@ -103,7 +104,7 @@ def compare(name: str, chosen: Preset, objects: Objects, steps: int, device: str
 
 
 def step_parts(name: str, trained: Trainer) -> list[Row]:
-    """Seconds of the parts of one step, by one thread: the profiler sees no other."""
+    """Rows for the seconds of the parts of one step, with one thread, because the profiler records only one."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -122,7 +123,7 @@ def step_parts(name: str, trained: Trainer) -> list[Row]:
 
 
 def curves(chosen: Preset, objects: Objects, steps: int) -> list[Row]:
-    """PSNR on unseen objects after equal steps of both paths, and the seconds that the steps took."""
+    """Rows for the PSNR on held-out objects after equal numbers of steps of both, and the seconds that they took."""
     trainers = both(chosen, objects)
     spent = dict.fromkeys(trainers, 0.0)
     rows: list[Row] = []
@@ -136,7 +137,7 @@ def curves(chosen: Preset, objects: Objects, steps: int) -> list[Row]:
 
 
 def unseen_psnr(trained: Trainer, objects: Objects) -> float:
-    """PSNR of query views of the held-out objects after the steps so far, by the default protocol for both paths."""
+    """PSNR of query views of the held-out objects, by the default protocol for both kinds of training."""
     found = []
     for name in objects.names("test"):
         task = objects.task(name)
@@ -147,7 +148,7 @@ def unseen_psnr(trained: Trainer, objects: Objects) -> float:
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """The rows of `curves`, over steps and over seconds."""
+    """Plot the rows of `curves`, over steps and over seconds."""
     figure = new_figure(10, 3.8)
     for axes, axis in zip(figure.subplots(1, 2, sharey=True), ("step", "seconds"), strict=True):
         for name, colour in (("packed", "#1a73e8"), ("dense", "#9aa0a6")):

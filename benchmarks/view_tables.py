@@ -11,9 +11,9 @@ from hyperplanes.utilities.tables import markdown_table
 __all__ = ["NAMES", "Result", "views", "views_over", "views_residuals", "views_summary", "views_tuned"]
 
 Result = dict[str, Any]
-"""A file of results: what was measured where, and its rows."""
+"""The content of a file of results: the environment of the measurement, and the rows."""
 
-SUMMARY = (3, 5, 25)  # numbers of views in README
+SUMMARY = (3, 5, 25)  # numbers of views in the table of README.md
 NAMES = {
     "cars": "cars",
     "chairs": "chairs",
@@ -23,7 +23,7 @@ NAMES = {
     "random-unseen": "compositions of random shapes",
     "chair": "the Blender chair",
 }
-"""Data sets of the suites, as the pages call them."""
+"""The names of the data sets of the suites in the documentation."""
 METHODS = {
     "nearest_view": "the nearest view",
     "hull_blend": "`hull_blend`",
@@ -33,14 +33,14 @@ METHODS = {
     "unrotated": "`small` without a canonical frame",
     "one_step": "**`small`**",
 }
-"""Rows of the table of views, in its order."""
+"""The rows of the table `views`, in order."""
 
 
 RowsOfViews = dict[tuple[str, int], Row]  # by method and number of views
 
 
 def _of_views(results: tuple[Result, ...]) -> tuple[dict[str, RowsOfViews], list[int]]:
-    """Rows of every data set, by the name that the pages call it, and all numbers of views."""
+    """The rows of each data set, by its name in the documentation, and all numbers of views."""
     found: dict[str, RowsOfViews] = {}
     for row in (row for result in results for row in result["rows"]):
         name = NAMES[row["data"].removeprefix("cc0-")]
@@ -55,7 +55,7 @@ def _table_of_views(counts: list[int], lines: list[list[str]]) -> str:
 
 
 def views(*results: Result) -> str:
-    """Every method by its numbers of views."""
+    """The table of the PSNR of all methods, for all numbers of views."""
     found, counts = _of_views(results)
     lines = []
     for name, rows in found.items():
@@ -69,7 +69,7 @@ def views(*results: Result) -> str:
 
 
 def views_over(*results: Result) -> str:
-    """How far one forward pass of `small` is above `hull_blend`."""
+    """The table of the gain of one forward pass of `small` over `hull_blend`."""
     found, counts = _of_views(results)
     lines = []
     for name, rows in found.items():
@@ -81,7 +81,7 @@ def views_over(*results: Result) -> str:
 
 
 def _above(row: dict[str, Any], name: str) -> str:
-    """A difference and, over several objects, its 95 % interval."""
+    """A difference and, if there are several objects, its 95 % interval."""
     if name not in row:
         return "-"
     if f"{name}_low" not in row:
@@ -90,7 +90,7 @@ def _above(row: dict[str, Any], name: str) -> str:
 
 
 def views_summary(*results: Result) -> str:
-    """`small` and, in parentheses, `hull_blend`: the table of README."""
+    """The table of README.md: the PSNR of `small` and, in parentheses, of `hull_blend`."""
     found, _ = _of_views(results)
     lines = []
     for name, rows in found.items():
@@ -100,7 +100,7 @@ def views_summary(*results: Result) -> str:
 
 
 def views_residuals(*results: Result) -> str:
-    """One forward pass of `small` without residual correction and with it, from as many views as it is made of."""
+    """The table of one forward pass of `small` without and with residual correction, for MANY_VIEWS views or more."""
     found, counts = _of_views(results)
     lines = []
     for name, rows in found.items():
@@ -114,7 +114,7 @@ def views_residuals(*results: Result) -> str:
 
 
 def views_tuned(*results: Result) -> str:
-    """Gradient steps from `small` beside as many from random weights."""
+    """The table of gradient steps from `small`, compared with as many from random weights."""
     found, counts = _of_views(results)
     lines = []
     for name, rows in found.items():

@@ -1,22 +1,20 @@
-"""PSNR over the number of support views: a model that takes any number of them, beside what learns nothing.
+"""Measure PSNR by the number of support views, for a model, variants of it, and baselines without learning.
 
     python -m benchmarks views --checkpoint small --data data/cars data/chairs --json FILE
     python -m benchmarks views --suite procedural random --objects 10 --json FILE
     python -m benchmarks views --suite srn --inputs 64 128 --objects 10 --json FILE
 
-Of every held-out object some query views are kept back to be judged by; of all others, support and query alike, so many
-are shown, as far apart as they stand. The rows: the nearest of them copied; their colours blended on the visual hull
-(where there are masks), of views alone and with their reflections; the model without its hypernetwork, with the update
-of another object of the data set, with its own alone, averaged with the visual hull by one share an object, without
-reflections of views, without a canonical frame, without learned steps, with one ray a pixel, in single precision,
-without residual correction (of steps, too), and as it is used; and fine-tuned. Beside each mean stands how far it lies
-above `hull_blend`, steps above as many from random weights, and what is corrected above what is not, with the 95 %
-interval of that difference over the objects (paired, Student's t).
+Of every held-out object, some query views are reserved for evaluation. The support views are chosen from all other
+views, such that they are as far apart as possible. The methods are: copying the nearest view; blending the support
+views on the visual hull (if there are masks), without and with their reflections; the model, with one row for each of
+--methods that changes or omits a part of it; and fine-tuning. Each row also has the gain over `hull_blend`, the gain of
+gradient steps over as many from random weights, and the gain by residual correction, each with the 95 % interval over
+the objects (paired, Student's t).
 
-With --inputs, those views alone are shown and all others are asked for: SRN's protocol, by which pixelNeRF and Splatter
-Image are compared, has 251 views on a spiral, of which view 64, or views 64 and 128, are shown.
+With --inputs, only these views are support views, and all others are query views. In SRN's protocol, which pixelNeRF
+and Splatter Image use, an object has 251 views on a spiral; the support views are view 64, or views 64 and 128.
 
-The suites are the data sets that every model is judged by; none of their objects is in any training.
+The suites are the data sets that all models are evaluated on. Their objects are in no training data.
 """
 
 from __future__ import annotations
@@ -62,38 +60,38 @@ from hyperplanes.views import Task, Tasks, Views
 
 __all__ = ["METHODS", "adapters", "add_data_options", "main", "suite_folders"]
 
-QUERY = 3  # views of each object that it is judged by, where the options do not say
+QUERY = 3  # default number of query views per object
 QUANTITIES = ("psnr", "psnr_foreground", "ssim", "adapt_seconds", "render_seconds")
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks views", description=__doc__)
     add_data_options(parser)
-    parser.add_argument("--counts", type=positive, nargs="+", help="numbers of support views: 1 3 5 10 25")
-    parser.add_argument("--steps", type=int, nargs="*", default=[], help="of fine-tuning, and of the same field "
-                        "from random weights")  # fmt: skip
-    parser.add_argument("--seeds", type=positive, default=1, help="of the steps; the mean over them counts")
-    parser.add_argument("--coarse", action="store_true", help="these by the grid of features as it is, too")
-    parser.add_argument("--objects", type=positive, default=3, help="of each data set")
-    parser.add_argument("--inputs", type=int, nargs="+", metavar="VIEW", help="instead of --counts: these views by "
-                        "their place, from 0")  # fmt: skip
-    parser.add_argument("--query", type=positive, help="views of each object to be judged by: 3; all with --inputs")
+    parser.add_argument("--counts", type=positive, nargs="+", help="numbers of support views (default: 1 3 5 10 25)")
+    parser.add_argument("--steps", type=int, nargs="*", default=[], help="numbers of gradient steps, for fine-tuning "
+                        "and for the same field from random weights")  # fmt: skip
+    parser.add_argument("--seeds", type=positive, default=1, help="number of seeds of the steps; rows have the mean")
+    parser.add_argument("--coarse", action="store_true", help="also take the steps without refining the feature grid")
+    parser.add_argument("--objects", type=positive, default=3, help="number of objects per data set")
+    parser.add_argument("--inputs", type=int, nargs="+", metavar="VIEW", help="instead of --counts: indices of the "
+                        "support views, from 0")  # fmt: skip
+    parser.add_argument("--query", type=positive, help="query views per object (default: 3; with --inputs, all)")
     parser.add_argument(
         "--methods",
         nargs="*",
         choices=METHODS,
         default=["nearest_view", "hull_blend", "swapped"],
-        help="beside the model itself",
+        help="methods other than the model itself",
     )
     parser.add_argument(
-        "--rotated", type=float, default=0.0, metavar="DEGREES", help="every scene, about its vertical axis"
+        "--rotated", type=float, default=0.0, metavar="DEGREES", help="rotate all scenes about their vertical axes"
     )
-    parser.add_argument("--pictures", type=Path, metavar="FILE", help="PNG: of each data set the best, the median and "
-                        "the worst view by the most views shown; columns are the truth and the numbers of views, "
-                        "ascending")  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="one count and two objects: to see that it runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--pictures", type=Path, metavar="FILE", help="PNG file for the best, the median and the worst "
+                        "view of each data set, by the largest number of support views; the columns are the true image "
+                        "and the numbers of views, ascending")  # fmt: skip
+    parser.add_argument("--quick", action="store_true", help="one count and two objects, to check that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     if chosen.counts and chosen.inputs:
         parser.error("--counts, --inputs: expected one of the two")
@@ -106,10 +104,10 @@ def main(arguments: list[str]) -> int:
     opened = [(suite, path, *_opened(path, chosen)) for suite, path in folders]
     model, rows, sheet = HyperPlanes.from_pretrained(find_checkpoint(Path(chosen.checkpoint))), [], []
     for suite, path, data, names, counts in opened:
-        seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count: truth and prediction of every view
+        seen: dict[int, list[tuple[Tensor, Tensor]]] = {}  # by count, the true image and the picture of every view
         for count in counts:
             shown = _Rotated(_tasks(data, count, chosen), chosen.rotated)
-            steps = chosen.steps if count > 1 else []  # a single view is not fine-tuned on
+            steps = chosen.steps if count > 1 else []  # fine-tuning needs more than one view
             made = seen.setdefault(count, [])
             about: Row = {"data": path.resolve().name, "views": count, "objects": len(names)}
             about |= {"suite": suite} if suite else {}
@@ -139,10 +137,10 @@ def _tasks(data: Tasks, count: int, chosen: argparse.Namespace) -> Tasks:
 
 
 def _opened(path: Path, chosen: argparse.Namespace) -> tuple[Tasks, list[str], list[int]]:
-    """A data set, the objects that are judged, and the numbers of views that can be shown of each of them.
+    """A data set, the objects to evaluate, and the numbers of support views that all of them have.
 
     Raises:
-        DataError: no such object, or fewer views than any number that was asked for.
+        DataError: there is no held-out object, or some object has too few views for all of --counts.
     """
     data = open_dataset(path)
     names = sorted(data.names("test"))[: chosen.objects]
@@ -164,14 +162,16 @@ def _opened(path: Path, chosen: argparse.Namespace) -> tuple[Tasks, list[str], l
 def _measured(
     by_seed: Sequence[Mapping[str, Adapter]], shown: Tasks, names: list[str], made: list[tuple[Tensor, Tensor]]
 ) -> Iterator[Row]:
-    """Measure the methods one after the other.
+    """Evaluate the methods one after the other.
 
     Args:
         by_seed: the methods by the names of their rows, for every seed.
-        made: takes the query views and what one forward pass makes of them.
+        shown: the tasks.
+        names: of the objects.
+        made: a list to which the query views and the pictures of one forward pass are appended.
 
     Yields:
-        The row of each method; of one with steps the mean over the seeds.
+        The row of each method; for a method with gradient steps, the mean over the seeds.
     """
     scores: dict[str, Score] = {}
     for method in sorted(by_seed[0], key=_after_its_references):
@@ -191,22 +191,22 @@ def _measured(
 
 
 def _keep(made: list[tuple[Tensor, Tensor]], _: ObjectScore, task: Task, pictures: Pictures, field: Renderable) -> None:
-    """Take the query views of an object, and what was made of them, into a list."""
+    """Append the query views of an object and their pictures to a list."""
     made.extend(zip(task.query.images, pictures.images, strict=True))
 
 
 def add_data_options(parser: argparse.ArgumentParser) -> None:
-    """--checkpoint, and --data or --suite and --root, which `suite_folders` reads."""
+    """Add the options --checkpoint, --data, --suite and --root; `suite_folders` reads the last three."""
     parser.add_argument("--checkpoint", default="small", help="a folder, or the name of a packaged model")
     parser.add_argument("--data", type=Path, nargs="+", help="data sets, or single scenes")
-    parser.add_argument("--suite", choices=SUITES, nargs="+", help="instead of --data: data sets in the folder --root")
-    parser.add_argument("--root", type=Path, default=Path("data"), help="of the suites")
+    parser.add_argument("--suite", choices=SUITES, nargs="+", help="instead of --data: suites in the folder --root")
+    parser.add_argument("--root", type=Path, default=Path("data"), help="folder with the data sets of the suites")
 
 
 def suite_folders(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -> list[tuple[str, Path]]:
-    """The data sets that --data, or --suite and --root, name, each with its suite, "" for none.
+    """The data sets of --data, or of --suite and --root, each with the name of its suite ("" for --data).
 
-    The parser says what is wrong with them.
+    Wrong options and missing folders are reported by the parser, which exits.
     """
     if (chosen.data is None) == (chosen.suite is None):
         parser.error("--data, --suite: expected one of the two")
@@ -227,7 +227,7 @@ SUITES: dict[str, dict[str, str]] = {
     "random": {"random-unseen": "--class random --count 12 --held-out 10 --resolution 128 --rig random --seed 9001"},
     "cc0": {
         f"cc0/{kind}": f"--meshes MESHES/{kind} --resolution 128 --rig random --seed 5 --held-out 0.99"
-        for kind in ("cars", "chairs", "lamps", "planes", "spacecraft")  # no training has anything of the last one
+        for kind in ("cars", "chairs", "lamps", "planes", "spacecraft")  # no training data contains spacecraft
     },
     "srn": {
         f"srn/{kind}s": f"--class {kind} --count 12 --held-out 10 --rig srn --seed 1300"
@@ -239,24 +239,24 @@ SUITES: dict[str, dict[str, str]] = {
     },
     "posed": {"chair": ""},
 }
-"""Data sets of each suite, and how `hyperplanes generate` makes them."""
+"""The data sets of each suite, with the options of `hyperplanes generate` that make them."""
 
 
 def made_by(suite: str, path: Path) -> str:
-    """The command that makes a data set of a suite, or where it is from."""
+    """The command that makes a data set of a suite, or its source."""
     options = next(options for name, options in SUITES[suite].items() if path.as_posix().endswith(name))
     return f"hyperplanes generate {options} --out {path}" if options else "hand: chair of the NeRF synthetic scenes"
 
 
 def _after_its_references(method: str) -> int:
-    """Sorts methods such that those come first that others are compared with."""
+    """A sort key for methods: those that others are compared with come first."""
     if method == "hull_blend":
         return 0
     return 1 if method.startswith("scratch_") or method.endswith("uncorrected") else 2
 
 
 def _above(score: Score, reference: Score) -> Row:
-    """By how much a method exceeds another one, with the interval over the objects where there are several."""
+    """The gain in PSNR over another method and, if there are several objects, its interval."""
     found, name = compare(score, reference), f"over_{reference.method}"
     row: Row = {name: found.mean}
     if found.low is not None and found.high is not None:
@@ -266,7 +266,7 @@ def _above(score: Score, reference: Score) -> Row:
 
 @dataclass(frozen=True)
 class _Rotated(TaskWrapper):
-    """Tasks whose scenes are rotated by so many degrees about their vertical axes."""
+    """Tasks whose scenes are rotated by an angle in degrees about their vertical axes."""
 
     degrees: float
 
@@ -276,7 +276,7 @@ class _Rotated(TaskWrapper):
 
 
 def _best_median_worst(seen: Mapping[int, Sequence[tuple[Tensor, Tensor]]]) -> list[Tensor]:
-    """Three rows of pictures: the truth, and what was predicted from ever more views."""
+    """Three rows of images: the true image, then the pictures by increasing numbers of support views."""
     most = seen[max(seen)]
     order = sorted(range(len(most)), key=lambda view: -float(psnr(most[view][1][None], most[view][0][None])))
     chosen = (order[0], order[len(order) // 2], order[-1])
@@ -293,7 +293,20 @@ def adapters(
     coarse: bool = False,
     seed: int = 0,
 ) -> Mapping[str, Adapter]:
-    """The rows by name; the seed is that of gradient steps."""
+    """The methods by the names of their rows.
+
+    Methods that do not apply are omitted: `swapped` without a hypernetwork or another object, and `hull_blend` without
+    masks.
+
+    Args:
+        model: the model.
+        shown: the tasks.
+        names: of the objects.
+        wanted: names in METHODS.
+        steps: numbers of gradient steps.
+        coarse: also take the steps without refining the feature grid.
+        seed: of the gradient steps.
+    """
     found: dict[str, Adapter] = {}
     for name in wanted:
         needs_others = name == "swapped" and (model.hypernetwork is None or len(names) < 2)
@@ -317,11 +330,11 @@ def adapters(
 
 @dataclass(frozen=True)
 class _FieldAlone:
-    """A model whose pictures are its field's alone, without the visual hull's.
+    """A model whose pictures are rendered from its field alone, not averaged with those of `hull_blend`.
 
     Attributes:
         model: the model.
-        updated: by the hypernetwork; else the field is that of theta.
+        updated: use the update of the hypernetwork; otherwise the field has the weights theta.
     """
 
     model: HyperPlanes
@@ -346,12 +359,12 @@ def _changed(model: HyperPlanes, **settings: Any) -> HyperPlanes:
 
 @dataclass(frozen=True)
 class _Ungated:
-    """A model without its gating network: one share of the visual hull an object, and fine-tuned fields alone."""
+    """A model without its gating network: `hull_blend` has one weight per object, and none in fine-tuned fields."""
 
     model: HyperPlanes | FineTuned
 
     def adapt(self, support: Views) -> AdaptedField:
-        """The model's own field without its gating network."""
+        """The field of the model without the gating network."""
         found = self.model.adapt(support).without_residuals()
         if isinstance(found, RotatedField):
             found = found.rotation.field(_ungated(found.unrotated))
@@ -365,40 +378,40 @@ def _ungated(field: AdaptedField) -> AdaptedField:
 
 @dataclass(frozen=True)
 class _Unreflected:
-    """A model that is shown no reflections of views."""
+    """A model that does not use reflections of the views."""
 
     model: HyperPlanes
 
     def adapt(self, support: Views) -> AdaptedField:
-        """The model's own field of the views alone."""
+        """The field that the model makes of the views alone."""
         return self.model.adapt_to(self.model.prepare(support))
 
 
 @dataclass(frozen=True)
 class _Unrotated:
-    """A model that takes every object as it faces in its scene."""
+    """A model that does not rotate objects into their canonical frames."""
 
     model: HyperPlanes
 
     def adapt(self, support: Views) -> AdaptedField:
-        """The model's own field in the frame of the scene."""
+        """The field that the model makes in the frame of the scene."""
         return self.model.adapt_to(self.model.prepare(support, symmetry=self.model.find_symmetry(support)))
 
 
 @dataclass(frozen=True)
 class _Rendered:
-    """A model whose pictures are rendered by other options, without residual correction.
+    """A model whose pictures are rendered with other options, without residual correction.
 
     Attributes:
         model: the model.
-        options: of `AdaptedField.render`.
+        options: keyword arguments of `AdaptedField.render`.
     """
 
     model: HyperPlanes
     options: Mapping[str, Any]
 
     def adapt(self, support: Views) -> Renderable:
-        """The field, and its pictures so."""
+        """The field, which renders with these options."""
         return _RenderedField(self.model.adapt(support), self.options)
 
 

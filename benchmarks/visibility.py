@@ -1,8 +1,9 @@
-"""Which views see a point: the compiled kernel beside the same in plain PyTorch, and what is built on it.
+"""Compare the compiled kernel that finds which views see a point with plain PyTorch, and time the code that uses it.
 
     python -m benchmarks visibility --json FILE
 
-Points in the visual hull of a procedural car, seen by 25 and by 50 views of 128 x 128 pixels; every way in turn.
+The points are in the visual hull of a procedural car with 25 and with 50 views of 128 x 128 pixels. All functions are
+measured alternately.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ BEST, NEAREST = 8, 4
 
 
 def main(arguments: list[str]) -> int:
-    """Measure, print, and write the rows where asked."""
+    """Measure, print the rows, and write them to --json if given."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks visibility", description=__doc__)
-    parser.add_argument("--points", type=positive, default=20_000)
-    parser.add_argument("--size", type=positive, default=128, help="pixels a side")
-    parser.add_argument("--views", type=positive, nargs="+", default=[25, 50])
-    parser.add_argument("--repeats", type=positive, default=15)
-    parser.add_argument("--quick", action="store_true", help="few points and pixels: to see that it runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the rows go")
+    parser.add_argument("--points", type=positive, default=20_000, help="number of points (default: %(default)s)")
+    parser.add_argument("--size", type=positive, default=128, help="pixels per side (default: %(default)s)")
+    parser.add_argument("--views", type=positive, nargs="+", default=[25, 50], help="numbers of views (default: 25 50)")
+    parser.add_argument("--repeats", type=positive, default=15, help="repetitions (default: %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="few points and pixels, to check that it runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
     if chosen.quick:
         chosen.points, chosen.size, chosen.views, chosen.repeats = 500, 32, [5], 2

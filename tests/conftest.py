@@ -1,4 +1,4 @@
-"""Shapes are checked in tests: the package's functions run under jaxtyping and beartype."""
+"""Setup of all tests: shapes are checked by jaxtyping and beartype, and random rays are few."""
 
 import atexit
 import gc
@@ -29,38 +29,38 @@ SLOWEST_FIRST = (
     "test_plane_dropout",
     "test_inputs",
 )
-"""Modules that processes of the tests begin with (`make test`), so that none of them is left for the end."""
+"""Test modules that run first with `make test`, so that no slow module is the last one running."""
 
-if "PYTEST_XDIST_WORKER" not in os.environ:  # as in a terminal, in the background and under nohup, too
+if "PYTEST_XDIST_WORKER" not in os.environ:  # default signal handlers, also in the background and under nohup
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-if "HYPERPLANES_TESTS" not in os.environ:  # the first process: it starts the others, which share the folder
+if "HYPERPLANES_TESTS" not in os.environ:  # the first process; the others inherit the variable and share the folder
     os.environ["HYPERPLANES_TESTS"] = tempfile.mkdtemp(prefix="hyperplanes-tests-")
     atexit.register(shutil.rmtree, os.environ["HYPERPLANES_TESTS"], ignore_errors=True)
-os.environ["HYPERPLANES_CACHE"] = tempfile.mkdtemp(dir=os.environ["HYPERPLANES_TESTS"])  # not the user's own
-os.environ.setdefault("LP_NUM_THREADS", "0")  # of Mesa, when it draws in this process, as workers have it
+os.environ["HYPERPLANES_CACHE"] = tempfile.mkdtemp(dir=os.environ["HYPERPLANES_TESTS"])  # not that of the user
+os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa renders without threads, as in workers
 
-STARTS_OTHERS = "-n" in sys.argv and ("-n", "0") not in pairwise(sys.argv) and "PYTEST_XDIST_WORKER" not in os.environ
-if not STARTS_OTHERS:  # the process that starts others (`make test`) runs no test
-    gc.disable()  # until everything is imported and found
+STARTS_WORKERS = "-n" in sys.argv and ("-n", "0") not in pairwise(sys.argv) and "PYTEST_XDIST_WORKER" not in os.environ
+if not STARTS_WORKERS:  # the process that starts the workers of `make test` runs no test itself
+    gc.disable()  # until all modules are imported and all tests are collected
     import second_device
     import torch
     import typechecker
 
-    second_device.register()  # before the first gradient, when autograd makes a queue for each device that it knows
-    torch.set_num_threads(1)  # small tensors: more threads only wait for each other; tests of threads set their own
+    second_device.register()  # autograd makes a queue per known device at the first gradient
+    torch.set_num_threads(1)  # tensors are small; tests of threads set their own number
     typechecker.install("hyperplanes")
 
     from hyperplanes.adaptation import learned_steps
 
-    ALL_RAYS, learned_steps.RAYS = learned_steps.RAYS, 128  # a step takes a tenth of the time so
+    ALL_RAYS, learned_steps.RAYS = learned_steps.RAYS, 128  # a learned step then takes a tenth of the time
 
 
 @pytest.fixture(scope="module")
 def all_rays():
-    """Learned steps by gradients of as many rays as users have."""
+    """Learned steps compute gradients from as many rays as outside of the tests."""
     from hyperplanes.adaptation import learned_steps
 
     with pytest.MonkeyPatch.context() as patch:
@@ -70,19 +70,19 @@ def all_rays():
 
 @pytest.fixture
 def unchecked(monkeypatch):
-    """Without the type checks of the tests, as users run it."""
+    """Disable the type checks of the tests, as for users."""
     import jaxtyping
 
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 def pytest_collection_modifyitems(items):
-    """Slow modules first; the others as they were."""
+    """Slow modules first; the order of the others does not change."""
     order = {name: place for place, name in enumerate(SLOWEST_FIRST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 def pytest_collection_finish():
-    """What was imported stays until the end: the garbage collector need not look at it again and again."""
+    """Exempt imported objects from garbage collection, because they exist until the end."""
     gc.freeze()
     gc.enable()

@@ -1,4 +1,4 @@
-"""Slow, obvious loops that the fast code is compared with. Nothing here is shared with the package."""
+"""Slow reference implementations as plain loops. They share no code with the package."""
 
 import math
 
@@ -10,13 +10,13 @@ BORDER = 0.01  # pixels
 
 
 def project(matrix, point):
-    """(column, row, depth) of a world point under a 3 x 4 matrix; None behind the camera."""
+    """Project a world point by a 3 x 4 matrix to (column, row, depth); None if it is behind the camera."""
     h = [sum(float(matrix[row][k]) * float(point[k]) for k in range(3)) + float(matrix[row][3]) for row in range(3)]
     return None if not NEAREST < h[2] < math.inf else (h[0] / h[2], h[1] / h[2], h[2])
 
 
 def bilinear(image, column, row):
-    """Colour (channel,) between the four pixel centres around (column, row), which lies inside the image."""
+    """The colour (channel,) at (column, row) inside the image, interpolated between pixel centres."""
     _, height, width = image.shape
     x, y = min(int(math.floor(column)), max(width - 2, 0)), min(int(math.floor(row)), max(height - 2, 0))
     right, below = min(x + 1, width - 1), min(y + 1, height - 1)
@@ -27,7 +27,7 @@ def bilinear(image, column, row):
 
 
 def unpack(packed):
-    """Images (view, 3, height, width) in [0, 1] of words that hold three channels of 8, or of 11, 11 and 10 bits."""
+    """Unpack words of 8, 8 and 8 or of 11, 11 and 10 bits to images (view, 3, height, width) in [0, 1]."""
     channels = []
     for first, width in ((0, 8), (8, 8), (16, 8)) if packed.bits == 8 else ((0, 11), (11, 11), (22, 10)):
         largest = 2**width - 1
@@ -36,7 +36,7 @@ def unpack(packed):
 
 
 def lookup(points, matrices, images, views=None, background=1.0):
-    """Colours (point, view, channel), coordinates (point, view, 2), valid (point, view), one lookup at a time."""
+    """Look up points in views, one at a time: colours (point, view, channel), coordinates (point, view, 2), valid."""
     chosen = [list(range(len(images)))] * len(points) if views is None else [list(row) for row in views]
     slots = len(images) if views is None else np.asarray(views).shape[1]
     channels, height, width = images.shape[1:]
@@ -59,7 +59,11 @@ def lookup(points, matrices, images, views=None, background=1.0):
 
 
 def hull(masks, matrices, centres, half_diagonal):
-    """Which voxels no view rules out: none whose bounding ball's picture misses every set pixel of some mask."""
+    """The visual hull: booleans that are true for voxels that no mask rules out.
+
+    A mask rules a voxel out if the projection of the voxel's bounding ball lies inside the image, and no pixel of the
+    mask in its bounding box is set.
+    """
     kept = np.ones(len(centres), bool)
     for index, centre in enumerate(centres):
         for mask, matrix in zip(masks, matrices, strict=True):
@@ -71,7 +75,7 @@ def hull(masks, matrices, centres, half_diagonal):
             focal = max(np.linalg.norm(matrix[0][:3]), np.linalg.norm(matrix[1][:3]))
             reach = math.ceil(2 * focal * half_diagonal / seen[2]) + 1
             if min(column, row) < reach or column + reach >= width or row + reach >= height:
-                continue  # part of the ball may lie beyond the picture
+                continue  # part of the ball may lie outside the image
             if not mask[row - reach : row + reach + 1, column - reach : column + reach + 1].any():
                 kept[index] = False
     return kept

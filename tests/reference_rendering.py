@@ -1,4 +1,4 @@
-"""Slow, obvious rendering, one ray and one sample at a time; and toy scenes: coloured balls seen by posed cameras."""
+"""Reference rendering, one ray and one sample at a time, and test scenes: coloured balls seen by posed cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hyperplanes.views import Task, Views
 
 
 def composite_ray(colours, densities, edges, background=1.0):
-    """(colour, opacity, depth, weights) of one ray by the textbook recursion, in Python numbers."""
+    """Composite one ray sample by sample, in Python numbers: (colour, opacity, depth, weights)."""
     left, colour, moment, weights = 1.0, [0.0, 0.0, 0.0], 0.0, []
     for (red, green, blue), density, near, far in zip(colours, densities, edges, edges[1:], strict=False):
         alpha = 1 - math.exp(-density * (far - near))
@@ -33,14 +33,14 @@ def composite_ray(colours, densities, edges, background=1.0):
 
 
 def voxel_is_occupied(occupied, centre, radius, point):
-    """Whether a point lies in an occupied voxel of the cube around a sphere."""
+    """Whether a point lies in an occupied voxel of the cube around a sphere; false outside the cube."""
     side = len(occupied)
     cell = [math.floor((p - c + radius) / (2 * radius) * side) for p, c in zip(point, centre, strict=True)]
     return all(0 <= i < side for i in cell) and bool(occupied[cell[0]][cell[1]][cell[2]])
 
 
 def march_ray(origin, direction, near, far, step, offset, occupied, centre, radius):
-    """The distances of the samples of one ray: every step from near, in occupied voxels, before far."""
+    """The distances of the samples of one ray: one per step from near to far, where the voxel is occupied."""
     found, index = [], 0
     while (t := near + (offset + index) * step) < far:
         point = [o + t * d for o, d in zip(origin, direction, strict=True)]
@@ -51,7 +51,7 @@ def march_ray(origin, direction, near, far, step, offset, occupied, centre, radi
 
 
 def ball_hit(origin, direction, centre, radius):
-    """The length of a ray within a ball."""
+    """The length of the part of a ray that is inside a ball."""
     to_centre = [c - o for c, o in zip(centre, origin, strict=True)]
     middle = sum(a * b for a, b in zip(to_centre, direction, strict=True))
     square = radius**2 - sum(a * a for a in to_centre) + middle**2
@@ -59,13 +59,13 @@ def ball_hit(origin, direction, centre, radius):
 
 
 def soft_ball(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """A smooth field: a ball of radius about a half that fades out, coloured by place and direction."""
+    """A smooth field: a ball of radius 0.5 with a soft surface, whose colour depends on position and direction."""
     colour = 0.5 + 0.25 * torch.sin(3 * points) + 0.2 * directions
     return colour.clamp(0, 1), 12 * torch.sigmoid((0.5 - points.norm(dim=-1)) * 20)
 
 
 def some_rays(count: int, *, seed: int = 0, dtype: torch.dtype = torch.float64) -> Rays:
-    """Rays from a sphere of radius 3 towards points of the unit ball."""
+    """Rays from a sphere of radius 3 towards points of a unit cube around the origin, with near 2 and far 4."""
     generator = torch.Generator().manual_seed(seed)
     origins = torch.randn(count, 3, generator=generator, dtype=dtype)
     origins = 3 * origins / origins.norm(dim=-1, keepdim=True)
@@ -75,18 +75,18 @@ def some_rays(count: int, *, seed: int = 0, dtype: torch.dtype = torch.float64) 
 
 
 def ring(count: int, size: tuple[int, int] = (16, 16), *, distance: float = 3.0, angle: float = 0.7, shift: int = 0):
-    """Cameras around the origin; `shift` turns the spiral so that two rings do not coincide."""
+    """Cameras on a spiral around the origin; another `shift` gives other positions."""
     poses = fibonacci_sphere(count + shift, distance)[shift:]
     return pinhole(symmetric_intrinsics(*size, angle), poses, *size)
 
 
 def camera_at(eye, size=(16, 16), *, target=(0.0, 0.0, 0.0), angle=0.7):
-    """One camera that looks from `eye` at `target`."""
+    """One camera at `eye` that looks at `target`."""
     return pinhole(symmetric_intrinsics(*size, angle), look_at(torch.tensor([eye]), target), *size)
 
 
 def ball_views(cameras, *, colour=(0.8, 0.2, 0.1), radius=0.5, masks=True, bounds: Sphere | None = None) -> Views:
-    """Pictures of a ball about the origin, of one hue and brighter towards +y, over white."""
+    """Views of a ball around the origin, in one hue that is brighter towards +y, over white."""
     height, width = int(cameras.height[0]), int(cameras.width[0])
     pixels = pixel_grid(height, width).repeat(cameras.batch_size, 1)
     view = torch.arange(cameras.batch_size).repeat_interleave(height * width)
@@ -101,7 +101,7 @@ def ball_views(cameras, *, colour=(0.8, 0.2, 0.1), radius=0.5, masks=True, bound
 
 
 class Balls:
-    """A data set in memory: one ball an object, of its own colour and size."""
+    """A data set in memory. Each object is a ball with its own colour and size."""
 
     def __init__(self, train: int = 3, test: int = 1, *, views: int = 4, size: tuple[int, int] = (16, 16)) -> None:
         self.views, self.size = views, size
@@ -117,8 +117,8 @@ class Balls:
         return self.ball(int(name[-1]) + (5 if name.startswith("test") else 0), name)
 
     def ball(self, number: float, name: str) -> Task:
-        """A ball whose colour and size are those of this number, 0 to 8."""
-        return Task(*copy.deepcopy(_drawn_ball(self.views, self.size, number)), name)  # tests may change their pixels
+        """A ball whose colour and size depend on a number from 0 to 8."""
+        return Task(*copy.deepcopy(_drawn_ball(self.views, self.size, number)), name)  # because tests change pixels
 
 
 @functools.cache
@@ -130,7 +130,7 @@ def _drawn_ball(views: int, size: tuple[int, int], number: float) -> tuple[Views
 
 
 def small_model(**changes):
-    """A HyperPlanes model of four planes with weights that say something; milliseconds to train and render."""
+    """A small HyperPlanes model of four planes, which trains and renders in milliseconds."""
     torch.manual_seed(0)
     parts = {
         "network": TargetConfig(depth=2, width=24, planes=4, point_frequencies=3, direction_frequencies=1),
@@ -144,7 +144,7 @@ def small_model(**changes):
 
 
 def awaken(model):
-    """Let the hypernetwork, whose outputs start at zero, change something."""
+    """Randomise the output layers of the hypernetwork, which start at zero; return the model."""
     if model.reads_volume:
         torch.nn.init.normal_(model.hypernetwork.encoder.last.weight, std=0.05)
         return model

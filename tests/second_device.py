@@ -1,7 +1,7 @@
-"""A device beside the CPU on a machine that has none, for tests: what a GPU refuses, it refuses.
+"""A PyTorch device in CPU memory, for tests on machines without a GPU: it raises the errors that a GPU raises.
 
-Its tensors lie in the CPU's memory. Operations on them compute there, but raise where operands lie on two devices, and
-NumPy cannot read them. Backends of PyTorch may be written in Python like this (`torch.utils.backend_registration`).
+Operations on its tensors are computed on the CPU. They raise if operands are on different devices, and NumPy cannot
+read its tensors. It is a backend that is written in Python (`torch.utils.backend_registration`).
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ __all__ = ["AVAILABLE", "NAME", "register", "second_device"]
 
 NAME = "second"
 AVAILABLE = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")
-"""Whether this PyTorch takes backends that are written in Python."""
+"""Whether this version of PyTorch supports backends that are written in Python."""
 
 _ATEN = torch.ops.aten
 _MOVING = {_ATEN._to_copy.default, _ATEN.copy_.default}
 _INDEXING = {_ATEN.index.Tensor, _ATEN.index_put_.default, _ATEN.index_put.default, _ATEN._index_put_impl_.default}
-"""Indices may lie on the CPU."""
+"""Operators whose indices may be on the CPU."""
 _WITHOUT_OPERATOR = {Tensor.new_tensor, Tensor.tolist, Tensor.numpy}
 
 
 @contextmanager
 def second_device() -> Generator[torch.device]:
-    """A device, as long as the context lasts; `register` was called before any gradient was computed."""
+    """The device, which can be used inside the context. `register` must be called before the first gradient."""
     with _Operations(), _Functions():
         yield torch.device(NAME, 0)
 
@@ -41,7 +41,7 @@ class _Remote(Tensor):
     """A tensor of the second device.
 
     Attributes:
-        held: the same numbers as a tensor of the CPU.
+        held: the same values in a CPU tensor.
     """
 
     held: Tensor
@@ -62,7 +62,7 @@ class _Remote(Tensor):
 
 
 class _Operations(TorchDispatchMode):
-    """Sees those, too, that make a tensor of none."""
+    """Dispatches operators that create tensors on the device, and those with operands on it."""
 
     def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
@@ -72,7 +72,7 @@ class _Operations(TorchDispatchMode):
 
 
 class _Functions(TorchFunctionMode):
-    """Those that PyTorch computes without asking an operator."""
+    """Handles functions that PyTorch implements without dispatching an operator."""
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
@@ -88,7 +88,7 @@ class _Functions(TorchFunctionMode):
 
 
 def _computed(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
-    """What an operator makes of tensors of the second device, or there."""
+    """The result of an operator with operands on the second device, or with a result there."""
     tensors = _tensors(args, kwargs)
     remote = any(isinstance(each, _Remote) for each in tensors)
     if remote and operator not in _MOVING:
@@ -115,7 +115,7 @@ def _computed(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any
 
 @cache
 def _aliases(operator: Any) -> bool:
-    """Whether a result is one of the arguments, or a view of it."""
+    """Whether the result of an operator is one of its arguments, or a view of one."""
     return any(each.alias_info is not None for each in operator._schema.returns)
 
 
@@ -132,7 +132,7 @@ def _held(value: Any) -> Any:
 
 
 def _tensors(args: Sequence[Any], kwargs: Mapping[str, Any]) -> list[Tensor]:
-    """Those among the arguments of an operator, and in lists among them: it has no other ones."""
+    """The tensors among the arguments of an operator, and in lists among them."""
     values = [*args, *kwargs.values()]
     lists = [each for each in values if isinstance(each, list | tuple)]
     return [each for value in (values, *lists) for each in value if isinstance(each, Tensor)]
@@ -144,9 +144,9 @@ def _is_second(device: Any) -> bool:
 
 @cache
 def register() -> torch.library.Library | None:
-    """Makes the device known to PyTorch, with what it asks for by itself: memory, and copies into it.
+    """Register the device with PyTorch, with functions that allocate memory and copy into it.
 
-    Not beside a GPU, whose gradients fail then: autograd takes streams of one kind of device.
+    It is not registered if there is a GPU, because autograd supports streams of only one kind of device.
     """
     if not AVAILABLE or torch.cuda.is_available():
         return None

@@ -1,4 +1,4 @@
-"""One tiny demonstration, made once for all tests that want its data set, checkpoints and page."""
+"""A small demonstration, made once for all tests that use its data set, checkpoints and page."""
 
 import atexit
 import fcntl
@@ -23,7 +23,7 @@ FEW = {"steps": 10, "frames": 2, "tuning": (0, 2)}
 
 @contextmanager
 def small_demo():
-    """While this lasts, `hyperplanes demo --quick-check` trains, fine-tunes and shows half as much or less."""
+    """While active, `hyperplanes demo --quick-check` trains fewer steps, fine-tunes less and renders fewer frames."""
     usual = DemoSettings.quick_check
     with rendered_here(), small_packaged(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(DemoSettings, "quick_check", lambda seed=0: replace(usual(seed), **FEW))
@@ -32,10 +32,10 @@ def small_demo():
 
 @functools.cache
 def demo_folder():
-    """The folder of `hyperplanes demo --quick-check` in `small_demo`: a copy for every process of the tests."""
+    """The folder of `hyperplanes demo --quick-check` in `small_demo`; each test process has its own copy."""
     shared = Path(os.environ["HYPERPLANES_TESTS"])
     with open(shared / "lock", "w", encoding="utf-8") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # whoever comes first makes it
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the first process makes it
         if not (shared / "demo").exists():
             with small_demo():
                 assert main(["demo", "--quick-check", "--out", str(shared / "unfinished")]) == 0
@@ -46,7 +46,7 @@ def demo_folder():
 
 
 def demo_preset():
-    """The model and the training of that demonstration."""
+    """The preset with the model and the training of the demonstration."""
     settings = replace(DemoSettings.quick_check(), **FEW)
     trained = next(each for each in settings.table.trainings if each.method == "hyperplanes")
     return configuration(settings.table, trained, settings.scale, settings.objects, settings.seed)

@@ -1,4 +1,4 @@
-"""A packaged model of milliseconds, for tests of commands and pages that show any of them."""
+"""A very small packaged model, for tests of commands and pages that work with any packaged model."""
 
 import tempfile
 from contextlib import contextmanager
@@ -16,10 +16,10 @@ from tests.reference_rendering import awaken
 
 @contextmanager
 def small_packaged(**changes):
-    """While this lasts, `small` has few weights, voxels and samples, and looks for no symmetry and no rotation.
+    """While active, `small` has few weights, voxels and samples, and does not search for symmetries and rotations.
 
     Args:
-        changes: of its configuration, further ones.
+        changes: further changes of its configuration.
     """
     config = ModelConfig.load(packaged_folder("small"))
     network = replace(config.network, depth=1, width=16, point_frequencies=1)

@@ -1,4 +1,4 @@
-"""Benchmarks of quality. Source of truth: the same figure computed beside them, and gradients of every weight."""
+"""Tests of benchmarks. Source of truth: the same figures computed separately, and gradients of every weight."""
 
 import importlib
 import inspect
@@ -36,20 +36,20 @@ def test_every_weight_of_every_variant_is_trained(name):
     model = HyperPlanes(replace(made.model, network=small, hull_resolution=16))
     training = replace(made.training, tasks=1, rays=48, views=(3, 5), episodes=4)
     trainer = Trainer(model, Balls(views=6, size=(24, 24)), training)
-    for _ in range(3):  # outputs of a hypernetwork that start at zero let nothing through in the first step
+    for _ in range(3):  # outputs of a hypernetwork start at zero and pass no gradients in the first step
         trainer.take_step()
     dead = {key for key, value in model.named_parameters() if value.grad is None or not value.grad.any()}
     assert not {key for key in dead if not key.startswith("hypernetwork")}, name
 
 
-def test_a_whole_update_as_parts_of_it_is_that_of_the_model():
+def test_the_unstacked_field_of_a_model_without_stacking_is_that_of_the_model():
     model, task = HyperPlanes(MODEL), Balls(views=6, size=(24, 24)).task("train0")
-    found = views.METHODS["unstacked"](model).adapt(task.support)  # outputs start at zero: nothing to leave out
+    found = views.METHODS["unstacked"](model).adapt(task.support)  # the update is zero
     expected, cameras = model.adapt(task.support), task.query.cameras
     assert torch.equal(found.render(cameras).images, expected.render(cameras).images)
 
 
-def test_a_model_without_its_gate_is_stacked_by_one_share(monkeypatch):
+def test_an_ungated_model_has_one_weight_of_the_hull_per_object(monkeypatch):
     model, task = HyperPlanes(replace(MODEL, stacked=True, gated=True)), Balls(views=6, size=(24, 24)).task("train0")
     monkeypatch.setattr(stacking, "hull_share", lambda *_: 0.4)
     found = views.METHODS["ungated"](model).adapt(task.support).render(task.query.cameras).images
@@ -59,13 +59,13 @@ def test_a_model_without_its_gate_is_stacked_by_one_share(monkeypatch):
 
 
 @pytest.mark.parametrize(("method", "option"), [("one_ray", "antialias"), ("single_precision", "mixed_precision")])
-def test_pictures_by_another_option_are_those_of_the_same_field(method, option):
+def test_variants_of_rendering_pass_their_option_to_the_same_field(method, option):
     field = types.SimpleNamespace(render=lambda cameras, **options: (cameras, options))
     model = types.SimpleNamespace(adapt=lambda support: types.SimpleNamespace(without_residuals=lambda: field))
     assert views.METHODS[method](model).adapt("views").render("cameras") == ("cameras", {option: False})
 
 
-def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
+def test_the_benchmark_of_views_fine_tunes_only_on_two_views_or_more(tmp_path):
     HyperPlanes(replace(MODEL, sampling=RayMarching(8), hull_resolution=16)).save(tmp_path / "model")
     options = ["--checkpoint", str(tmp_path / "model"), "--data", str(demo_folder() / "data"), "--objects", "1"]
     options += ["--query", "1", "--methods", "ungated", "uncorrected", "--counts", "1", "2", "--steps", "1", "--coarse"]
@@ -73,7 +73,7 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
     for seeds in ("1", "2"):
         assert views.main([*options, "--seeds", seeds, "--json", str(tmp_path / "rows.json")]) == 0
         found.append(json.loads((tmp_path / "rows.json").read_text())["rows"])
-    for one, two in zip(*found, strict=True):  # the first seed and the mean of two, where there are steps
+    for one, two in zip(*found, strict=True):  # rows with steps differ: one seed, and the mean of two
         tuned = "steps" in one["name"] or "scratch" in one["name"]
         assert two.get("seeds") == (2 if tuned else None)
         assert (one["psnr"] != two["psnr"]) == tuned
@@ -81,7 +81,7 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
             scratch = next(row for row in found[0] if row["name"] == "scratch_1")
             assert one["over_scratch_1"] == pytest.approx(one["psnr"] - scratch["psnr"])
     quality = {(row["views"], row["name"]): row["psnr"] for row in found[0]}
-    for row in found[0]:  # what is corrected beside what is not
+    for row in found[0]:  # the gain of residual correction
         if row["name"] in ("one_step", "1_steps"):
             uncorrected = "uncorrected" if row["name"] == "one_step" else "1_steps_uncorrected"
             assert row[f"over_{uncorrected}"] == pytest.approx(row["psnr"] - quality[row["views"], uncorrected])
@@ -107,19 +107,19 @@ def test_the_benchmark_of_views_fine_tunes_on_more_than_one(tmp_path):
         (["views", "--data", "DATA", "--inputs", "99"], "expected inputs from 0 to 11, got (99,)"),
     ],
 )
-def test_mistakes_are_one_line(words, expected, tmp_path, monkeypatch, capsys):
+def test_wrong_input_is_reported_in_one_line(words, expected, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(benchmarks_main, "load_at_start", lambda: 0.0)
     places = {"DATA": str(demo_folder() / "data"), "OUT": str(tmp_path)}
     try:
         code = benchmarks_main.main([places.get(w, w.replace("OUT", places["OUT"])) for w in words])
-    except SystemExit as ended:  # by argparse, after the usage
+    except SystemExit as ended:  # argparse exits after printing the usage
         code = ended.code
     assert code == 2
     assert expected in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_rows_are_of_numbers_of_views_that_were_shown(monkeypatch, capsys):
-    """By hand: of 12 views of an object three are kept back, so nine can be shown."""
+def test_there_are_no_rows_for_more_views_than_objects_have(monkeypatch, capsys):
+    """By hand: three of the 12 views of an object are query views, so at most nine can be support views."""
     monkeypatch.setattr(views, "adapters", lambda *_, **__: {})
     monkeypatch.setattr(views, "_measured", lambda *_: [{"name": "a method"}])
     monkeypatch.setattr(views, "_best_median_worst", lambda seen: [])
@@ -130,7 +130,7 @@ def test_rows_are_of_numbers_of_views_that_were_shown(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_the_parts_of_a_step_are_those_that_its_table_names(threads):
+def test_all_parts_of_a_step_in_the_table_are_measured(threads):
     trainer = Trainer(HyperPlanes(MODEL), Balls(), TrainingConfig(tasks=1, rays=16, views=(1, 3)))
     before = torch.get_num_threads()
     try:
@@ -144,16 +144,16 @@ def test_the_parts_of_a_step_are_those_that_its_table_names(threads):
 
 
 @pytest.mark.parametrize("option", ["--json=rows.json", "--js=rows.json", "--j"])
-def test_rows_are_kept_however_the_option_is_written(option, monkeypatch, capsys):
-    """Property: argparse takes these as --json, so does the check of the load."""
+def test_all_spellings_of_the_option_json_are_recognised(option, monkeypatch, capsys):
+    """Property: the check of the load recognises the spellings that argparse accepts as --json."""
     monkeypatch.setattr(benchmarks_main, "load_at_start", lambda: 1.4)
     assert benchmarks_main.main(["small", "--quick", option]) == 2
     assert "1.4 cores busy" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", sorted(OF_SPEED))
-def test_rows_of_speed_are_not_kept_beside_other_work(name, tmp_path, monkeypatch, capsys):
-    """Property: with more than 0.3 cores busy nothing is measured or written; the message says how to do it anyway."""
+def test_rows_of_speed_are_not_written_on_a_busy_machine(name, tmp_path, monkeypatch, capsys):
+    """Property: with more than 0.3 busy cores, nothing is measured or written without --under-load."""
     ran = []
     benchmark = types.SimpleNamespace(main=lambda arguments: ran.append(arguments))
     monkeypatch.setattr(benchmarks_main, "import_module", lambda _: benchmark)
@@ -166,9 +166,9 @@ def test_rows_of_speed_are_not_kept_beside_other_work(name, tmp_path, monkeypatc
 
 
 def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch, capsys):
-    """Property: a benchmark that is added is one of `all`, with options that it has; it decides itself about a load.
+    """Property: `all` runs every benchmark, with options that the benchmark has, and passes --under-load on.
 
-    Three make no rows of their own: `gating` makes weights.
+    `all`, `tables` and `gating` make no rows themselves.
     """
     ran, without_rows = [], {"all", "tables", "gating"}
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -176,7 +176,7 @@ def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch
     monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
     assert all_benchmarks.main(["--out", str(tmp_path)]) == 0
     assert {name for name, *_ in ran} == set(benchmarks_main.NAMES) - {*without_rows, *all_benchmarks.OF_DATA}
-    assert "without --data none of views, " in capsys.readouterr().out
+    assert "without --data, views, " in capsys.readouterr().out
     ran.clear()
     assert all_benchmarks.main(["--out", str(tmp_path), "--data", "cars", "--under-load"]) == 0
     assert {words[1] for words in ran} == set(benchmarks_main.NAMES) - without_rows
@@ -191,14 +191,14 @@ def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("name", ["gpu", "lookup", "rendering", "training"])
-def test_a_device_that_is_not_here_is_one_line(name, capsys):
+def test_an_unavailable_device_is_reported_in_one_line(name, capsys):
     with pytest.raises(SystemExit) as ended:
         benchmarks_main.main([name, "--device", "cuda:7"])
     assert ended.value.code == 2
     assert "got 'cuda:7'" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_all_measures_a_gpu_only_where_there_is_one(tmp_path, monkeypatch):
+def test_all_measures_a_gpu_only_if_there_is_one(tmp_path, monkeypatch):
     ran = []
     run = types.SimpleNamespace(returncode=0)
     monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
@@ -210,17 +210,17 @@ def test_all_measures_a_gpu_only_where_there_is_one(tmp_path, monkeypatch):
         assert sum("cuda" in words for words in ran) == here  # lookups
 
 
-def test_all_bakes_the_scene_that_it_adapts_to_beside_the_data(tmp_path, monkeypatch):
+def test_all_passes_the_scene_to_adapting_and_to_baked(tmp_path, monkeypatch):
     ran = {}
     run = types.SimpleNamespace(returncode=0)
     monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.setdefault(command[3], command[4:]) and run)
     assert all_benchmarks.main(["--out", str(tmp_path), "--data", "cars", "chairs", "--scene", "chair"]) == 0
     assert ran["adapting"][:2] == ["--views", "chair"]
     assert ran["baked"][:4] == ["--data", "cars", "chairs", "chair"]
-    assert ran["steps"][:3] == ["--data", "cars", "--json"]  # takes one
+    assert ran["steps"][:3] == ["--data", "cars", "--json"]  # only the first data set
 
 
-def test_training_steps_are_measured_by_the_threads_that_are_asked_for(monkeypatch, capsys):
+def test_training_steps_are_measured_with_the_number_of_threads_of_the_option(monkeypatch, capsys):
     before = torch.get_num_threads()
     monkeypatch.setattr(steps, "_measured", lambda chosen: [{"name": "a step", "threads": torch.get_num_threads()}])
     for options, threads in (([], 1), (["--threads", "3"], 3)):
@@ -229,11 +229,11 @@ def test_training_steps_are_measured_by_the_threads_that_are_asked_for(monkeypat
         assert torch.get_num_threads() == before
 
 
-def test_the_table_of_parts_names_every_variant():
+def test_the_table_of_the_image_based_field_names_every_variant():
     assert tables.VARIANTS.keys() == image_based.VARIANTS.keys()
 
 
-def test_all_runs_those_of_speed_alone_and_those_of_quality_several_at_once(tmp_path, monkeypatch, capsys):
+def test_all_runs_benchmarks_of_speed_alone_and_of_quality_in_parallel(tmp_path, monkeypatch, capsys):
     running, beside, lock = [], {True: set(), False: set()}, threading.Lock()
 
     def run(command, check, env):
@@ -256,7 +256,7 @@ def test_all_runs_those_of_speed_alone_and_those_of_quality_several_at_once(tmp_
     assert not any(OF_SPEED & set(names) for names in beside[False])
 
 
-def test_other_ways_to_draw_on_a_gpu_show_the_same_field():
+def test_implementations_of_rendering_show_the_same_field():
     model, task = HyperPlanes(MODEL), Balls(views=6, size=(24, 24)).task("train0")
     adapted, cameras = model.adapt(task.support), task.query.cameras
     expected = adapted.render(cameras, antialias=False, mixed_precision=False).images
@@ -268,14 +268,14 @@ def test_other_ways_to_draw_on_a_gpu_show_the_same_field():
 
 
 @pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
-def test_tables_of_pages_are_the_rows_that_were_measured(page):
-    """Another way to the same: each page is written anew from the results, `python -m benchmarks tables`."""
+def test_tables_of_pages_match_the_measured_rows(page):
+    """Another implementation: each page is filled again from the results, as by `python -m benchmarks tables`."""
     text = page.read_text(encoding="utf-8")
     assert tables.fill(text) == text
     assert len(tables.MARKED.findall(text)) == text.count("<!-- benchmarks ")
 
 
-def test_a_table_has_the_numbers_of_its_rows_and_the_load_they_were_measured_with(tmp_path):
+def test_a_table_has_the_numbers_of_its_rows_and_the_load_of_the_measurement(tmp_path):
     rows = [
         {"name": "lookup", "load": load, "policy": "passive", "threads": threads, "seconds": 0.5, "speedup": speedup}
         for load, threads, speedup in (("idle", 1, 1), ("idle", 2, 1.75), ("busy", 1, 1), ("busy", 2, 0.9))
@@ -294,7 +294,7 @@ def test_a_table_has_the_numbers_of_its_rows_and_the_load_they_were_measured_wit
             tables.fill(f"<!-- benchmarks {name} -->\n<!-- end -->", tmp_path)
 
 
-def test_ways_to_draw_that_do_not_work_leave_their_cells_empty(tmp_path):
+def test_implementations_that_failed_have_empty_cells(tmp_path):
     drawn = {"milliseconds": 2.0, "psnr": 30.0, "peak_gib": 1.5}
     ways = ["one ray a pixel", "paper's protocol", "no TF32"]
     rows = [{"name": f"small, 200x200, {way}", **drawn} for way in ways]
@@ -311,7 +311,7 @@ def test_ways_to_draw_that_do_not_work_leave_their_cells_empty(tmp_path):
 
 
 def test_tables_of_views_take_the_rows_of_all_suites(tmp_path):
-    """By hand: two suites of one object name; a number of views that only one of them was measured with."""
+    """By hand: two suites have a data set of the same name; one number of views is measured in only one of them."""
     machine = {"benchmark": "views", "commit": "abc1234"}
     for suite, counts in (("procedural", (3, 5, 25)), ("cc0", (3, 5, 10, 25)), ("random", ()), ("posed", ())):
         rows = []
@@ -336,8 +336,8 @@ def test_tables_of_views_take_the_rows_of_all_suites(tmp_path):
     assert f"*Commit abc1234 ({files}); Commit def5678 (views_posed.json).*" in found
 
 
-def test_a_process_that_spins_is_a_load():
-    """Property: one spinning process keeps about one core busy, less where others run beside it."""
+def test_a_busy_loop_in_another_process_raises_the_load():
+    """Property: a busy loop in another process uses about one core, or less if the machine has other work."""
     from benchmarks.load import measure_load
 
     before = measure_load(0.2)

@@ -1,4 +1,4 @@
-"""Source of truth: what the command line promises its users: exit codes, one line a mistake, files that are there."""
+"""Tests of the command line: exit codes, one line per mistake, and the files that are written."""
 
 import csv
 import errno
@@ -61,8 +61,8 @@ def tiny_preset():
     return replace(quick, model=replace(quick.model, network=network), initialisation=initialisation)
 
 
-def complaint(capsys):
-    """The only line on standard error."""
+def error_line(capsys):
+    """The single line on standard error."""
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1, lines
     return lines[0]
@@ -74,7 +74,7 @@ def pixels(path):
 
 
 def first_views(scene, folder, *, support, query):
-    """A copy of a scene with its first support and query views alone."""
+    """A copy of a scene with only its first support and query views."""
     shutil.copytree(scene, folder)
     document = json.loads((folder / "transforms.json").read_text())
     kept = {"train_filenames": support, "test_filenames": query}
@@ -87,7 +87,7 @@ def first_views(scene, folder, *, support, query):
 
 @contextmanager
 def unread_pipe():
-    """A pipe to write to, whose reader has gone."""
+    """The writing end of a pipe whose reading end is closed."""
     read, write = os.pipe()
     os.close(read)
     pipe = os.fdopen(write, "w")
@@ -100,7 +100,7 @@ def unread_pipe():
 
 @pytest.fixture
 def compiled(monkeypatch):
-    """The kernels of a demonstration need no compiling, as after one of `demo_folder`."""
+    """Skip compiling kernels in a demonstration."""
     monkeypatch.setattr("hyperplanes.experiments.demonstration.steps.compile_kernels", lambda device: None)
 
 
@@ -115,7 +115,7 @@ def test_help_loads_nothing_heavy():
 
 
 @pytest.mark.parametrize("asked", ["--help", "--version"])
-def test_the_module_is_the_command_and_a_reader_who_leaves_early_is_no_error(asked):
+def test_the_module_is_the_command_and_a_closed_pipe_is_no_error(asked):
     command = [sys.executable, "-m", "hyperplanes", asked]
     whole = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     assert "hyperplanes" in whole.stdout
@@ -124,12 +124,12 @@ def test_the_module_is_the_command_and_a_reader_who_leaves_early_is_no_error(ask
     assert (left.returncode, left.stderr) == (0, "")
 
 
-def test_a_reader_who_leaves_a_table_early_is_no_error(monkeypatch, capsys):
-    """In this process: one of its own takes seconds to load what the table is of."""
+def test_a_pipe_that_is_closed_during_a_table_is_no_error(monkeypatch, capsys):
+    """In this process, because a new one takes seconds to import the configurations."""
     with unread_pipe() as pipe:
         monkeypatch.setattr(sys, "stdout", pipe)
         assert main(["presets"]) == 0
-        assert sys.stdout is None, "Python flushes nothing more when it ends"
+        assert sys.stdout is None, "standard output must not be flushed again at exit"
         monkeypatch.undo()
     assert capsys.readouterr().err == ""
 
@@ -157,9 +157,9 @@ for verb in sys.argv[1:]:
             assert "or a packaged model: small, small-paper, cars-64" in text
 
 
-def test_an_unknown_verb_is_answered_with_the_nearest(capsys):
+def test_an_unknown_verb_is_answered_with_a_suggestion(capsys):
     assert main(["trian"]) == 2
-    assert "did you mean train?" in complaint(capsys)
+    assert "did you mean train?" in error_line(capsys)
 
 
 def test_an_unknown_flag_is_wrong_input(capsys):
@@ -179,10 +179,10 @@ def test_an_unknown_flag_is_wrong_input(capsys):
         ("train --training.learning_rate 1 --training.learning-rate 2", "--training.learning-rate"),
     ],
 )
-def test_an_option_that_stands_twice_is_refused(line, option, capsys):
-    """The parser would take the last and drop the others."""
+def test_an_option_that_is_given_twice_is_refused(line, option, capsys):
+    """The parser would silently use the last value."""
     assert main([*line.split(), "--out", "unused"]) == 2
-    assert f"{option}: expected once, got it twice" in complaint(capsys)
+    assert f"{option}: expected once, got it twice" in error_line(capsys)
 
 
 def test_version(capsys):
@@ -357,9 +357,9 @@ def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, cap
         return text
 
     assert main([placed(argument) for argument in arguments]) == 2
-    line = complaint(capsys)
+    line = error_line(capsys)
     assert all(placed(part) in line for part in parts), line
-    assert not list(tmp_path.iterdir()), "what is refused leaves nothing behind"
+    assert not list(tmp_path.iterdir()), "a refused command leaves no files"
 
 
 @pytest.mark.parametrize(
@@ -370,13 +370,13 @@ def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, cap
         ("bake", "photos/images/car.safetensors", ["--orbit", "2"]),
     ],
 )
-def test_pictures_are_not_written_over_those_that_are_read(verb, out, more, tmp_path, monkeypatch, capsys):
+def test_pictures_do_not_overwrite_the_images_that_are_read(verb, out, more, tmp_path, monkeypatch, capsys):
     shutil.copytree(locate_scene("example-car"), tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
     before = {path: path.read_bytes() for path in (tmp_path / "photos").rglob("*") if path.is_file()}
     arguments = [verb, "--checkpoint", str(demo_folder() / "hyperplanes"), "--views", "photos", "--out", out, *more]
     assert main(arguments) == 2
-    assert "--out: expected a folder that no images or poses are read from, got photos/images" in complaint(capsys)
+    assert "--out: expected a folder that no images or poses are read from, got photos/images" in error_line(capsys)
     assert {path: path.read_bytes() for path in (tmp_path / "photos").rglob("*") if path.is_file()} == before
 
 
@@ -391,7 +391,7 @@ def test_a_full_disk_is_one_line(monkeypatch, capsys):
 
     monkeypatch.setattr("hyperplanes.commands.presets.run", full)
     assert main(["presets"]) == 2
-    line = complaint(capsys)
+    line = error_line(capsys)
     assert "/data/x.png" in line
     assert "full disk" in line
 
@@ -423,10 +423,10 @@ def test_without_any_renderer_one_line_says_what_to_install(tmp_path, monkeypatc
 
     monkeypatch.setattr("data_gen.rendering.renderers.find_renderer", nothing)
     assert main(["generate", "--class", "car", "--out", str(tmp_path)]) == 2
-    assert "apt-get install -y libegl1 libgl1" in complaint(capsys)
+    assert "apt-get install -y libegl1 libgl1" in error_line(capsys)
 
 
-def test_generate_takes_cameras_of_any_distance_and_lens(tmp_path):
+def test_generate_takes_any_distance_and_field_of_view(tmp_path):
     command = ["generate", "--class", "car", "--count", "1", "--views", "2", "--resolution", "16", "--held-out", "0"]
     lens = ["--distance", "6", "--field-of-view", "30"]
     with rendered_here():
@@ -437,7 +437,7 @@ def test_generate_takes_cameras_of_any_distance_and_lens(tmp_path):
     assert np.linalg.norm(pose[:3, 3]) == pytest.approx(6)
 
 
-def test_generate_verifies_and_mends_when_asked(tmp_path, capsys):
+def test_generate_verifies_and_repairs_if_asked(tmp_path, capsys):
     command = ["generate", "--class", "lamp", "--count", "2", "--views", "2", "--resolution", "16", "--workers", "1"]
     with rendered_here():
         assert main([*command, "--rig", "paper-128", "--verify", "--out", str(tmp_path)]) == 0
@@ -450,7 +450,7 @@ def test_generate_verifies_and_mends_when_asked(tmp_path, capsys):
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.png")} == before
 
 
-def test_inspect_compares_checksums_when_asked(tmp_path, capsys):
+def test_inspect_compares_checksums_if_asked(tmp_path, capsys):
     data = tmp_path / "data"
     shutil.copytree(demo_folder() / "data", data)
     command = ["inspect", str(data), "--out", str(tmp_path / "out"), "--checksums"]
@@ -463,7 +463,7 @@ def test_inspect_compares_checksums_when_asked(tmp_path, capsys):
     assert f"{changed.relative_to(data)} has changed" in capsys.readouterr().out
 
 
-def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
+def test_evaluate_writes_all_methods_to_one_table(tmp_path, capsys):
     demo = demo_folder()
     table = tmp_path / "table.json"
     methods = ["nearest_view", "point_multiplane", "hyperplanes"]
@@ -478,8 +478,8 @@ def test_evaluate_writes_every_method_through_one_table(tmp_path, capsys):
         assert f"{written[name]['psnr']:.2f} dB" in shown
 
 
-def test_views_that_were_shown_and_are_asked_for_are_counted(tmp_path, capsys):
-    """By hand: of so many support views, those that are more than there are come from the query views."""
+def test_query_views_that_are_support_views_too_are_counted(tmp_path, capsys):
+    """By hand: support views in excess of those of the scene are taken from its query views."""
     task, files = read_task(locate_scene("example-car")), [tmp_path / "a.json", tmp_path / "a.md", tmp_path / "a.csv"]
     options = [each for pair in zip(("--json", "--markdown", "--csv"), files, strict=True) for each in pair]
     for shown in (0, 2):
@@ -493,7 +493,7 @@ def test_views_that_were_shown_and_are_asked_for_are_counted(tmp_path, capsys):
         assert [said in text for text in (streams.out + streams.err, files[1].read_text())] == [shown > 0] * 2
 
 
-def test_two_checkpoints_of_one_method_are_refused_wherever_they_are_and_a_folder_given_twice_is_one(tmp_path):
+def test_two_checkpoints_of_one_method_are_refused_and_a_folder_given_twice_counts_once(tmp_path):
     run = demo_folder() / "hyperplanes"
     for name in ("b", "a"):
         shutil.copytree(run, tmp_path / name)
@@ -557,7 +557,7 @@ def test_render_adds_residuals_when_asked_to(tmp_path, capsys):
         assert abs(pixels(tmp_path / Path(name).name) - expected).max() <= 1
     capsys.readouterr()
     assert main([*command, "--protocol", "paper"]) == 2
-    assert "--protocol: expected none with --residuals" in complaint(capsys)
+    assert "--protocol: expected none with --residuals" in error_line(capsys)
 
 
 def test_pictures_of_many_views_are_corrected_unless_that_is_off(tmp_path, monkeypatch, capsys):
@@ -567,7 +567,7 @@ def test_pictures_of_many_views_are_corrected_unless_that_is_off(tmp_path, monke
     with small_packaged(learned_steps=0):
         assert main(["render", *command, "--out", str(tmp_path / "corrected")]) == 0
         assert "2 pictures corrected by residuals" in capsys.readouterr().out
-        # no support view is rendered where pictures are not corrected: for these, for their estimate, nor for voxels
+        # without correction no support view is rendered: for pictures, for their estimated PSNR, or for voxels
         monkeypatch.setattr(ResidualField, "_compute", lambda *_: pytest.fail("a support view was rendered"))
         assert main(["render", *command, "--out", str(tmp_path / "plain"), "--residuals", "off"]) == 0
         capsys.readouterr()
@@ -595,11 +595,11 @@ def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
         assert path.read_bytes() == (Path(reference) / path.name).read_bytes()
     assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, "--steps", "2"]) == 0
     assert any(path.read_bytes() != (Path(reference) / path.name).read_bytes() for path in Path(out).iterdir())
-    frozen = ["--steps", "2", "--fine-tune", "hypernetwork"]  # there is none any more
+    frozen = ["--steps", "2", "--fine-tune", "hypernetwork"]  # adapted weights have no hypernetwork
     assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, *frozen]) == 2
 
 
-def test_steps_chosen_on_left_out_views_are_reported(tmp_path, monkeypatch, capsys):
+def test_the_number_of_steps_that_held_out_views_choose_is_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("hyperplanes.configuration.fine_tuning.FineTuning", partial(FineTuning, max_steps=2))
     monkeypatch.setattr("hyperplanes.export.mesh_level.SILHOUETTE", 16)
     demo, scene = demo_folder(), str(first_object(demo_folder()))
@@ -614,10 +614,10 @@ def test_steps_chosen_on_left_out_views_are_reported(tmp_path, monkeypatch, caps
     assert main(["export", *common, "--what", "mesh", "--mesh-format", "ply", "--out", str(tmp_path / "export")]) == 0
     assert main(["bake", *common, "--fit", "0", "--out", str(tmp_path / "voxels.safetensors")]) == 0
     adapted = r"adapted to 6 views of .* in .*, \d+ fine-tuning steps|adapted to these 6 views before"
-    assert len(re.findall(adapted, capsys.readouterr().out)) == 2  # kept where the first one took long
+    assert len(re.findall(adapted, capsys.readouterr().out)) == 2  # the second time from the cache
 
 
-def test_a_stage_of_capture_that_returns_has_a_bar_that_is_open(tmp_path, monkeypatch):
+def test_a_stage_of_capture_that_is_repeated_has_a_new_progress_bar(tmp_path, monkeypatch):
     opened, shown = [], []
 
     @contextmanager
@@ -640,7 +640,7 @@ def test_a_stage_of_capture_that_returns_has_a_bar_that_is_open(tmp_path, monkey
 def test_a_turntable_of_no_frames_is_refused_before_anything_is_made(tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["export", "--checkpoint", "small", "--views", "example-car", "--out", str(out), "--frames", "0"]) == 2
-    assert "--frames" in complaint(capsys)
+    assert "--frames" in error_line(capsys)
     assert not out.exists()
 
 
@@ -655,10 +655,10 @@ def test_psnr_over_fine_tuning_steps_is_a_table_and_a_chart(tmp_path, capsys):
     texts = [each.text for each in ElementTree.fromstring(chart.read_text()).iter("{http://www.w3.org/2000/svg}text")]
     assert {"nearest_view", "hyperplanes", "scratch", "fine-tuning steps", "PSNR (dB)"} <= set(texts)
     assert main([*command, *methods, "3"]) == 2
-    assert "at least two numbers of --steps" in complaint(capsys)
+    assert "at least two numbers of --steps" in error_line(capsys)
 
 
-def test_a_method_that_fails_on_every_object_is_left_out_of_the_chart(tmp_path, monkeypatch, capsys):
+def test_a_method_that_fails_on_all_objects_is_omitted_from_the_chart(tmp_path, monkeypatch, capsys):
     def fails(self, support):
         raise ValueError("support: no masks")
 
@@ -672,7 +672,7 @@ def test_a_method_that_fails_on_every_object_is_left_out_of_the_chart(tmp_path, 
 
 
 @pytest.mark.parametrize("given", [[], ["--all-views"], ["--learn-background"], ["--refine-poses"], ["--up=y"]])
-def test_adapt_names_the_command_that_shows_its_weights_the_same_views(given, tmp_path, monkeypatch, capsys):
+def test_adapt_proposes_a_command_that_renders_with_the_same_views(given, tmp_path, monkeypatch, capsys):
     scene, small = str(first_object(demo_folder())), HyperPlanes.from_pretrained(demo_folder() / "hyperplanes")
     task, _ = read_scene(Path(scene), Console(silent=True))
     monkeypatch.setattr(adapt, "read_object", lambda *_: (task, "y"))
@@ -684,7 +684,7 @@ def test_adapt_names_the_command_that_shows_its_weights_the_same_views(given, tm
     proposed = tyro.cli(render.Arguments, args=command[2:])
     assert (proposed.checkpoint, proposed.views) == (tmp_path / "my out", Path(scene))
     taken = {name: getattr(proposed, name) for name in ("all_views", "learn_background", "refine_poses")}
-    up = given == ["--up=y"]  # stated, though the cameras of the scene may tell something else
+    up = given == ["--up=y"]  # an explicit --up stays in the command
     assert proposed.up == ("y" if up else "auto")
     assert [f"--{name.replace('_', '-')}" for name, value in taken.items() if value] == ([] if up else given)
 
@@ -772,10 +772,10 @@ def test_seeds_of_trainings_and_of_gradient_steps_in_every_kind_of_file(tmp_path
     texts = [each.text for each in ElementTree.fromstring((tmp_path / "boxes.svg").read_text()).iter()]
     assert {"nearest_view", "hyperplanes", "hyperplanes_2"} <= set(texts)
     assert main(["evaluate", *data, *methods, *seeded[:2], "--seeds", "0"]) == 2
-    assert "--seeds: expected at least 1, got 0" in complaint(capsys)
+    assert "--seeds: expected at least 1, got 0" in error_line(capsys)
 
 
-def test_inspect_tells_what_the_hypernetwork_does(capsys):
+def test_inspect_shows_diagnostics_of_the_hypernetwork(capsys):
     assert main(["inspect", str(demo_folder() / "hyperplanes")]) == 0
     assert re.search(r"diagnostics: updates differ by [\d.]+% of their norm", capsys.readouterr().out)
     assert main(["inspect", "cars-64"]) == 0
@@ -802,8 +802,8 @@ def test_a_cloud_of_points_is_exported(tmp_path, capsys):
     assert f"points.ply: {number} points with normals and colours" in capsys.readouterr().out
 
 
-def test_what_only_the_field_can_refuse_is_named_as_it_was_typed(tmp_path, monkeypatch, capsys):
-    """A level above all densities, and means of points of which none is on the surface."""
+def test_errors_of_the_field_name_the_option_as_it_was_typed(tmp_path, monkeypatch, capsys):
+    """A level above all densities, and a point cloud of which no point is on the surface."""
     monkeypatch.setattr("hyperplanes.export.points._is_confirmed", lambda points, *_: torch.zeros(len(points)) > 0)
     demo = demo_folder()
     line = ["export", "--checkpoint", str(demo), "--views", str(first_object(demo)), "--out", str(tmp_path)]
@@ -813,8 +813,8 @@ def test_what_only_the_field_can_refuse_is_named_as_it_was_typed(tmp_path, monke
         assert f"hyperplanes export: {option}: expected more" in capsys.readouterr().err
 
 
-def test_a_camera_path_of_nerfstudio_is_pictures_of_all_that_is_asked_for(tmp_path, capsys):
-    """The poses of the query views as a path: the same pictures, of another size where asked; none from elsewhere."""
+def test_a_camera_path_of_nerfstudio_is_rendered_with_all_requested_outputs(tmp_path, capsys):
+    """The poses of the query views as a path give the same pictures; a path far from the object is warned about."""
     demo = demo_folder()
     scene = first_object(demo)
     document = json.loads((scene / "transforms.json").read_text())
@@ -840,7 +840,7 @@ def test_a_camera_path_of_nerfstudio_is_pictures_of_all_that_is_asked_for(tmp_pa
         with Image.open(place / "camera_path.gif") as animation:
             assert animation.n_frames == len(frames)
     for frame in path["camera_path"]:
-        for row in (0, 4, 8):  # to its right
+        for row in (0, 4, 8):  # move the camera to its right
             frame["camera_to_world"][row + 3] += 1000.0 * frame["camera_to_world"][row]
     (tmp_path / "path.json").write_text(json.dumps(path))
     assert main([*line, "--size", "8"]) == 0
@@ -849,12 +849,12 @@ def test_a_camera_path_of_nerfstudio_is_pictures_of_all_that_is_asked_for(tmp_pa
     assert max(pixels(tmp_path / "out/0000.png").shape[:2]) == 8
 
 
-def test_baking_writes_one_file_that_renders_by_itself(tmp_path, monkeypatch, capsys):
+def test_baking_writes_one_file_that_can_be_rendered_without_the_model(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("hyperplanes.export.mesh_level.SILHOUETTE", 16)
     out = tmp_path / "voxels.safetensors"
     views = ["--views", str(first_object(demo_folder())), "--out", str(out)]
     command = ["bake", "--checkpoint", str(demo_folder()), *views, "--voxels", "32", "--fit", "2"]
-    with one_writer(tmp_path):  # of another file
+    with one_writer(tmp_path):  # another file in the folder may be written meanwhile
         assert main([*command, "--orbit", "2", "--size", "16", "--turntable", "gif"]) == 0
     assert "dB, the field" in capsys.readouterr().out
     with Image.open(tmp_path / "voxels.gif") as animation:
@@ -865,7 +865,7 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, monkeypatch, ca
     advised = []
     monkeypatch.setattr(suitability, "worse_than_copying", lambda *given: advised.append(given[-1]) or [])
     assert main(["render", "--checkpoint", str(out), *scene]) == 0
-    assert advised == [None]  # no steps, which a baked file refuses
+    assert advised == [None]  # no advice to fine-tune, which a baked file does not support
     names = sorted(Path(name).name for name in read_task(first_object(demo_folder())).query.names)
     for name, image in zip(names, to_pixels(pictures.images).astype(int), strict=True):
         assert abs(pixels(tmp_path / "again" / name) - image).max() <= 1
@@ -874,11 +874,11 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, monkeypatch, ca
     told = capsys.readouterr()
     assert re.search(r"overlap the rendered ones of 6 query views by [\d.]+%", told.out)
     assert "--level" in told.err
-    assert "--steps" not in told.err  # nor here
+    assert "--steps" not in told.err  # likewise
     assert main(["inspect", str(out)]) == 0
     assert "of 32^3 voxels" in capsys.readouterr().out
     capsys.readouterr()
-    monkeypatch.setattr("hyperplanes.commands.scene.read_scene", None)  # refused before pictures are read
+    monkeypatch.setattr("hyperplanes.commands.scene.read_scene", None)  # refused before images are read
     adapting = (["--steps", "3"], ["--refine-poses"], ["--learn-background"])
     for verb, *option in (
         *([verb, *option] for verb in ("render", "export") for option in adapting),
@@ -887,14 +887,14 @@ def test_baking_writes_one_file_that_renders_by_itself(tmp_path, monkeypatch, ca
         *(["export", "--fit", "3", "--what", what] for what in ("page", "turntable")),
     ):
         assert main([verb, "--checkpoint", str(out), *scene, *option]) == 2
-        assert f"{option[0]}: expected none with a baked file" in complaint(capsys)
+        assert f"{option[0]}: expected none with a baked file" in error_line(capsys)
     assert main(["adapt", "--checkpoint", str(out), *scene]) == 2
-    assert "expected a checkpoint's folder to adapt with, got a file" in complaint(capsys)
+    assert "expected a checkpoint's folder to adapt with, got a file" in error_line(capsys)
     assert main([*command[:-4], "--voxels", "7"]) == 2
-    assert "7" in complaint(capsys)
+    assert "7" in error_line(capsys)
 
 
-def test_a_turntable_of_voxels_that_are_not_fitted_is_of_the_field(tmp_path, monkeypatch, capsys):
+def test_a_turntable_without_fitting_is_rendered_from_the_field(tmp_path, monkeypatch, capsys):
     asked = []
 
     def noted(field, views, cameras, representation="auto", **_):
@@ -915,11 +915,11 @@ def test_a_video_that_cannot_be_encoded_is_refused_before_anything_is_rendered(t
     for verb, more in (("render", ["--orbit", "2"]), ("bake", ["--orbit", "2"]), ("export", ["--what", "turntable"])):
         out = tmp_path / ("voxels.safetensors" if verb == "bake" else "out")
         assert main([verb, *views, "--out", str(out), "--turntable", "mp4", *more]) == 2
-        assert "mp4: expected the package imageio-ffmpeg, found none" in complaint(capsys)
+        assert "mp4: expected the package imageio-ffmpeg, found none" in error_line(capsys)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_paper_protocol_is_rendered_and_evaluated_when_asked_for(tmp_path, capsys):
+def test_pictures_are_rendered_and_evaluated_by_the_protocol_of_the_paper_if_asked(tmp_path, capsys):
     demo = demo_folder()
     scene = first_views(first_object(demo), tmp_path / "scene", support=6, query=1)
     command = ["render", "--checkpoint", str(demo), "--views", str(scene), "--out", str(tmp_path)]
@@ -965,15 +965,15 @@ def test_the_scene_that_comes_with_the_package_has_a_name(tmp_path, monkeypatch,
     told = capsys.readouterr().out
     assert "views: 25 support, 25 query" in told
     by_model, copied = map(float, re.findall(r"(?:given at|copied has) ([\d.]+)", told))
-    assert by_model > copied + 5  # of views left out: 30.1 and 14.8 dB
+    assert by_model > copied + 5  # PSNR of held-out views: 30.1 and 14.8 dB
     assert (tmp_path / "runs" / "inspect" / "example-car" / "contact_sheet.png").exists()
-    (tmp_path / "example-car").mkdir()  # a folder of that name goes first
+    (tmp_path / "example-car").mkdir()  # a folder of that name has precedence
     with pytest.raises(DataError, match="example-car"):
         read_scene(Path("example-car"), Console(silent=True))
 
 
 def with_z_up(scene, folder):
-    """A copy of a scene, its cameras turned by hand as Blender would have written them."""
+    """A copy of a scene whose camera poses are rotated by hand to z up, as in Blender."""
     shutil.copytree(scene, folder)
     document = json.loads((folder / "transforms.json").read_text())
     for frame in document["frames"]:
@@ -983,8 +983,8 @@ def with_z_up(scene, folder):
     return folder
 
 
-def test_views_of_a_world_with_z_up_are_adapted_to_as_if_y_were(tmp_path):
-    """Source of truth: the same scene."""
+def test_a_scene_with_z_up_gives_the_same_pictures(tmp_path):
+    """Source of truth: the same scene with y up."""
     demo = demo_folder()
     scene = first_object(demo)
     turned = with_z_up(scene, tmp_path / scene.name)
@@ -995,8 +995,8 @@ def test_views_of_a_world_with_z_up_are_adapted_to_as_if_y_were(tmp_path):
         assert abs(pixels(path) - pixels(tmp_path / "z" / path.name)).max() <= 1
 
 
-def test_a_single_scene_is_evaluated_with_the_way_up_that_its_cameras_tell(tmp_path, capsys):
-    """Source of truth: the same scene in a world with y up, and its object in the data set."""
+def test_a_single_scene_is_evaluated_with_the_up_axis_estimated_from_its_cameras(tmp_path, capsys):
+    """Source of truth: the same scene with y up, and the object in the data set."""
     demo = demo_folder()
     scene = first_object(demo)
     turned = with_z_up(scene, tmp_path / scene.name)
@@ -1018,10 +1018,10 @@ def test_a_single_scene_is_evaluated_with_the_way_up_that_its_cameras_tell(tmp_p
     assert quality(demo / "data") == pytest.approx(expected, abs=1e-2)
     assert "up:" not in capsys.readouterr().out
     assert main(["evaluate", "--data", str(turned), "--up", "w"]) == 2
-    assert "up: expected one of y, z, " in complaint(capsys)
+    assert "up: expected one of y, z, " in error_line(capsys)
 
 
-def test_photographs_with_a_background_are_warned_about_and_ways_up_are_said(tmp_path, capsys):
+def test_render_warns_of_photographs_with_a_background_and_prints_the_up_axis(tmp_path, capsys):
     scene = tmp_path / "photographs"
     shutil.copytree(first_object(demo_folder()), scene)
     for path in scene.rglob("*.png"):
@@ -1037,7 +1037,7 @@ def test_photographs_with_a_background_are_warned_about_and_ways_up_are_said(tmp
     assert re.search("worse than copying the nearest view: .*; cut the object out first", shown.err)
 
 
-def test_the_demonstration_does_nothing_twice(capsys):
+def test_the_demonstration_repeats_no_finished_step(capsys):
     demo = demo_folder()
     before = {path: path.stat().st_mtime_ns for path in demo.rglob("*") if path.is_file()}
     capsys.readouterr()
@@ -1065,10 +1065,10 @@ def test_the_demonstration_shows_the_packaged_model_before_anything_is_trained(t
     command = ["demo", "--quick-check", "--first-only", "--meshes", str(tmp_path), "--out", str(tmp_path / "out")]
     with small_demo():
         assert main(command) == 2
-    assert str(tmp_path) in capsys.readouterr().err.strip().splitlines()[-1]  # a folder without a mesh
+    assert str(tmp_path) in capsys.readouterr().err.strip().splitlines()[-1]  # the folder has no mesh
 
 
-def test_ctrl_c_saves_and_the_same_command_ends_as_if_it_had_not_happened(tmp_path, monkeypatch, capsys):
+def test_training_continues_after_ctrl_c_with_the_same_result(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(PRESETS, "tiny", demo_preset())
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     command = ["train", "--data", str(demo_folder() / "data"), "--preset", "tiny", "--steps", "4", "--out"]
@@ -1104,7 +1104,7 @@ def test_a_real_posed_scene_is_evaluated(tmp_path):
     assert json.loads(table.read_text())["nearest_view"]["psnr"] > 10
 
 
-def test_a_package_that_is_missing_is_named_in_one_line(monkeypatch, capsys):
+def test_a_missing_package_is_named_in_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", "example-car", "--downscale", "4"]) == 2
     line = capsys.readouterr().err.strip().splitlines()[-1]

@@ -1,4 +1,4 @@
-"""Every convention of the package against an independent source: OpenCV, SciPy, Kornia, or a closed form."""
+"""All conventions of the package, compared with an independent source: OpenCV, SciPy, Kornia, or a closed form."""
 
 import inspect
 import math
@@ -41,11 +41,11 @@ def opencv_pixels(points, matrix, camera_from_world, distortion=None):
 
 @pytest.mark.parametrize("axes", ["opencv", "opengl"])
 @pytest.mark.parametrize("centres", ["integer", "half"])
-def test_projection_is_opencvs(axes, centres):
-    """Poses in either axes and principal points in either pixel convention land on OpenCV's pixels."""
+def test_projection_agrees_with_opencv(axes, centres):
+    """With poses in both axis conventions and principal points in both pixel conventions, pixels are OpenCV's."""
     pose, matrix = poses(), K.clone()
     expected = opencv_pixels(some_points(), K, pose)
-    if axes == "opengl":  # stored as Blender does: camera-to-world, y up, looking along -z
+    if axes == "opengl":  # as Blender stores poses: world_from_camera, y up, looking along -z
         flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
         stored = torch.linalg.inv(pose) @ flip
         torch.testing.assert_close(cameras.opengl_from_opencv(pose), stored)
@@ -63,7 +63,7 @@ def test_projection_is_opencvs(axes, centres):
 
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_lookup_coordinates_are_opencvs_pixels(backend, dtype):
+def test_lookup_coordinates_agree_with_opencv(backend, dtype):
     ours = cameras.pinhole(K, poses(), HEIGHT, WIDTH)
     expected = opencv_pixels(some_points(), K, poses())
     found = ImagePlanes(torch.zeros(6, 1, HEIGHT, WIDTH, dtype=dtype), ours, backend=backend).lookup(
@@ -77,13 +77,13 @@ def test_lookup_coordinates_are_opencvs_pixels(backend, dtype):
     np.testing.assert_array_equal(inside, within)
 
 
-def test_projection_is_kornias():
+def test_projection_agrees_with_kornia():
     ours = cameras.pinhole(K, poses(), HEIGHT, WIDTH)
     pixels, _ = project(some_points(), cameras.projection_matrices(ours), None)
     torch.testing.assert_close(pixels.transpose(0, 1), ours.project(some_points().expand(6, -1, 3)))
 
 
-def test_coordinates_are_kornias():
+def test_coordinates_agree_with_kornia():
     ours = cameras.pinhole(K, poses(), HEIGHT, WIDTH)
     found = ImagePlanes(torch.zeros(6, 1, HEIGHT, WIDTH, dtype=torch.float64), ours).lookup(some_points())
     pixels = ours.project(some_points().expand(6, -1, 3))
@@ -93,8 +93,8 @@ def test_coordinates_are_kornias():
 
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
 @pytest.mark.parametrize("chosen", [False, True])
-def test_sampling_is_scipys(backend, chosen):
-    """map_coordinates, order 1: pixel (row, column) is centred at (row, column)."""
+def test_sampling_agrees_with_scipy(backend, chosen):
+    """SciPy's map_coordinates of order 1, in which pixel (row, column) is centred at (row, column)."""
     images = torch.rand(6, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     ours = cameras.pinhole(K, poses(), HEIGHT, WIDTH)
     views = torch.arange(6).expand(200, 6) if chosen else None
@@ -108,7 +108,7 @@ def test_sampling_is_scipys(backend, chosen):
 
 
 def test_pixel_centres_sample_themselves():
-    """Closed form: coordinates of pixel centres return the pixels, (column, row) in that order."""
+    """Closed form: at the coordinates of pixel centres, (column, row), samples are the pixels."""
     image = torch.arange(12.0).reshape(1, 1, 3, 4)
     coordinates = pixel_grid(3, 4) / torch.tensor([3.0, 2.0]) * 2 - 1
     assert interpolate(image, coordinates[:, None], None).flatten().tolist() == list(range(12))
@@ -128,7 +128,7 @@ def test_rays_invert_projection():
 
 
 def test_rays_meet_the_bounding_sphere():
-    """Closed form: from 3 away through the middle of a unit sphere, 2 to 4; beside it, nothing."""
+    """Closed form: a ray from distance 3 through the centre of a unit sphere is inside it from 2 to 4."""
     matrix = cameras.symmetric_intrinsics(65, 65, 1.2)
     ours = cameras.pinhole(matrix, cameras.look_at(torch.tensor([[0.0, 0.0, 3.0]])), 65, 65)
     pixels = torch.tensor([[32.0, 32.0], [0.0, 0.0]])
@@ -142,7 +142,7 @@ def test_rays_meet_the_bounding_sphere():
 
 
 def test_image_axes():
-    """Closed form: seen from +z with y up, world +x is to the right and world +y is up in the picture."""
+    """Closed form: seen from +z with y up, world +x points right and world +y points up in the image."""
     ours = cameras.pinhole(
         cameras.symmetric_intrinsics(64, 64, 0.7), cameras.look_at(torch.tensor([[0.0, 0.0, 3.0]])), 64, 64
     )
@@ -157,14 +157,14 @@ def test_image_axes():
 
 
 def test_orbit_is_a_ring():
-    """Closed form: equal distances and elevations, optical axes through the origin, viewing directions unit."""
+    """Closed form: equal distances and elevations, optical axes through the origin, unit viewing directions."""
     ours = cameras.pinhole(cameras.symmetric_intrinsics(8, 8, 0.7), cameras.orbit(7, 2.0, math.radians(30)), 8, 8)
     torch.testing.assert_close(cameras.centres(ours)[:, 1], torch.full((7,), 1.0))
     torch.testing.assert_close(cameras.centres(ours), -2.0 * cameras.viewing_directions(ours), atol=1e-5, rtol=0)
 
 
 def test_resizing_moves_borders_not_centres():
-    """Closed form: a corner of the picture stays a corner: column -1/2 -> -1/2, W - 1/2 -> 2 W - 1/2."""
+    """Closed form: the image borders are mapped to each other: column -1/2 to -1/2, W - 1/2 to 2 W - 1/2."""
     ours = cameras.pinhole(K, poses(), HEIGHT, WIDTH)
     larger = cameras.resized(ours, 2 * HEIGHT, 2 * WIDTH)
     small, _ = project(some_points(), cameras.projection_matrices(ours), None)
@@ -172,8 +172,8 @@ def test_resizing_moves_borders_not_centres():
     torch.testing.assert_close(large + 0.5, 2 * (small + 0.5))
 
 
-def test_storage_that_breaks_kornia_is_not_made():
-    """(view, 4, 4) storage, float sizes, a copy for each batch: what Kornia's project needs."""
+def test_cameras_are_stored_as_kornia_needs_them():
+    """Kornia's `project` needs matrices (view, 4, 4) and sizes as floats."""
     ours = cameras.select(cameras.pinhole(K, poses(), HEIGHT, WIDTH), [4, 1])
     assert ours.intrinsics.shape == ours.extrinsics.shape == (2, 4, 4)
     assert ours.height.dtype == torch.float64
@@ -191,7 +191,7 @@ def test_storage_that_breaks_kornia_is_not_made():
         (lambda k, p: (k, p * math.nan), "got NaN or infinity in view 0"),
     ],
 )
-def test_wrong_cameras_are_stopped(change, message):
+def test_wrong_cameras_are_refused(change, message):
     matrix, pose = change(K, poses())
     with pytest.raises((ValueError, TypeError), match=message):
         inspect.unwrap(cameras.pinhole)(matrix, pose, HEIGHT, WIDTH)

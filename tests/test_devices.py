@@ -1,4 +1,4 @@
-"""Source of truth: the CPU, whose results a GPU has within rounding, and so has a device made of the CPU's memory."""
+"""Source of truth: results on the CPU, with which a GPU, or a device in CPU memory, agrees within rounding."""
 
 import copy
 from contextlib import nullcontext
@@ -32,7 +32,7 @@ CPU = torch.device("cpu")
 HAS_GPU = torch.cuda.is_available()
 pytestmark = pytest.mark.skipif(not (HAS_GPU or AVAILABLE), reason="needs a GPU, or PyTorch with backends in Python")
 ALL_SAMPLES = RayMarching(32, 0.0)
-"""Rays do not stop: all samples have gradients, none of which is drawn."""
+"""Rays do not stop, so that all samples have gradients and none are chosen at random."""
 PLAIN = {"antialias": False, "mixed_precision": False}
 ACROSS = Plane((1.0, 0.0, 0.0), 0.0)
 
@@ -42,7 +42,7 @@ def other_device():
 
 
 def on_both(compute):
-    """What a function of a device returns for the other device and for the CPU."""
+    """The results of a function of the device, on the other device and on the CPU."""
     expected = compute(CPU)
     with other_device() as device:
         return compute(device), expected
@@ -94,7 +94,7 @@ def test_lookups_and_their_gradients():
     torch.testing.assert_close(found.cpu(), expected, atol=1e-3, rtol=1e-4)
 
 
-def test_one_step_shows_the_same_picture():
+def test_one_forward_pass_gives_the_same_picture():
     def shown(where):
         task = car(where)
         return small(where, learned_steps=1).adapt(task.support).render(task.query.cameras, **PLAIN)
@@ -105,8 +105,8 @@ def test_one_step_shows_the_same_picture():
     assert float(expected.opacity.mean()) > 0.05
 
 
-def test_pictures_are_corrected_alike(monkeypatch):
-    """Those of a mean with the hull, by the share and the gate that held-out views decide."""
+def test_corrected_pictures_are_the_same(monkeypatch):
+    """With stacking, whose weights held-out views decide."""
     monkeypatch.setattr(held_out, "PIXELS", 128)
 
     def shown(where):
@@ -120,7 +120,7 @@ def test_pictures_are_corrected_alike(monkeypatch):
     assert float((found.cpu() - expected).square().mean()) < 1e-5
 
 
-def test_gradient_steps_end_with_the_same_weights():
+def test_fine_tuned_fields_give_the_same_picture():
     settings = FineTuning(rays=64)
 
     def tuned(where):
@@ -132,10 +132,10 @@ def test_gradient_steps_end_with_the_same_weights():
     assert float((found.cpu() - expected).square().mean()) < 1e-4
 
 
-def test_rays_that_end_where_they_are_opaque_are_shown_alike():
-    """On the CPU in rounds, until little light is left; elsewhere all samples at once, with gradients or without.
+def test_rays_that_end_when_they_are_opaque_have_the_same_colours():
+    """The CPU evaluates samples in rounds until the transmittance is low; other devices evaluate all at once.
 
-    The weights are those of the forward pass: learned steps read gradients of such rays, and end 1.5 % apart.
+    There are no learned steps, because they read gradients of such rays, and their results differ by 1.5 %.
     """
 
     def shown(where):
@@ -153,7 +153,7 @@ def test_rays_that_end_where_they_are_opaque_are_shown_alike():
         assert float((here - there).square().mean()) < 1e-6
 
 
-def test_planes_of_symmetry_are_found():
+def test_symmetry_planes_are_the_same():
     def found(where):
         support = car(where, shown=12, size=32).support
         hull = carve(support.masks, support.cameras, support.bounds, 32)
@@ -163,7 +163,7 @@ def test_planes_of_symmetry_are_found():
     torch.testing.assert_close(*on_both(found), atol=0.02, rtol=0)
 
 
-def test_planes_are_judged_alike(monkeypatch):
+def test_errors_of_symmetry_planes_are_the_same(monkeypatch):
     monkeypatch.setattr(symmetry, "PIXELS", 256)
     monkeypatch.setattr(symmetry, "carved", partial(carved, side=24))
     for module in (symmetry, reflections):
@@ -180,7 +180,7 @@ def test_planes_are_judged_alike(monkeypatch):
     assert found == pytest.approx(expected, rel=0.02)
 
 
-def test_frames_are_judged_alike_and_rotated_fields_shown_alike():
+def test_qualities_of_frames_and_pictures_of_rotated_fields_are_the_same():
     def judged(where):
         task, model = car(where, shown=3, size=16), small(where)
         placed = Placed(Rotation(0.5).views(task.support), None, Rotation(0.5))
@@ -194,7 +194,7 @@ def test_frames_are_judged_alike_and_rotated_fields_shown_alike():
     assert float((picture - expected[2]).square().mean()) < 1e-4
 
 
-def test_the_hull_of_views_and_reflections_looks_the_same(monkeypatch):
+def test_the_hull_blend_of_views_and_reflections_is_the_same(monkeypatch):
     monkeypatch.setattr(reflections, "HULL_SIDE", 32)
 
     def shown(where):
@@ -226,7 +226,7 @@ def test_a_training_step_has_the_same_loss():
     assert found == pytest.approx(expected, rel=1e-3)
 
 
-def test_voxels_are_baked_from_it():
+def test_baked_voxels_are_as_many():
     found, expected = on_both(lambda where: bake(small(where).adapt(car(where).support), side=16).values)
     assert found.device.type == "cpu"
     assert abs(len(found) - len(expected)) <= 0.02 * len(expected)

@@ -1,4 +1,4 @@
-"""Source of truth: the lines of README and of the pages, run as they stand there."""
+"""Source of truth: the code in README.md and the other pages, which is run as it is."""
 
 import dataclasses
 import re
@@ -34,7 +34,7 @@ def test_the_method_in_code_runs():
     assert here["loss"].requires_grad
 
 
-def test_the_readme_shows_what_is_there():
+def test_files_that_the_readme_links_to_exist():
     for path in re.findall(r"\]\((?!https?:)([^)#]+)\)", README):
         assert (ROOT / path).exists(), path
 
@@ -46,7 +46,7 @@ def test_the_readme_names_verbs_that_exist():
         assert verb in find_verbs()
 
 
-def test_every_public_name_is_there():
+def test_all_public_names_exist():
     for name in hyperplanes.__all__:
         assert getattr(hyperplanes, name) is not None
     assert set(hyperplanes.__all__) <= set(dir(hyperplanes))
@@ -54,7 +54,7 @@ def test_every_public_name_is_there():
 
 
 def test_the_template_of_a_package_adds_its_field_and_its_method(monkeypatch, tmp_path):
-    """Its entry points are read from its pyproject.toml; its field is the same on both sides."""
+    """The entry points are read from its pyproject.toml. Property: its field is symmetric in x."""
     import tomllib
     from importlib.metadata import EntryPoint, EntryPoints
 

@@ -1,4 +1,4 @@
-"""Source of truth: the layers of CONTRIBUTING.md, held against every import in the packages, by a string too."""
+"""Source of truth: the layers of CONTRIBUTING.md, compared with all imports in the packages, also those by strings."""
 
 import ast
 import re
@@ -38,10 +38,10 @@ LAYERS = {
     "hyperplanes.parameters": 1,
     "hyperplanes.utilities": 0.5,
 }
-INSIDE = {"hyperplanes.data": ("pictures", "formats", "dataset", "inspection")}  # from the ground up
+INSIDE = {"hyperplanes.data": ("pictures", "formats", "dataset", "inspection")}  # from the lowest to the highest
 OURS = ("hyperplanes", "data_gen", "benchmarks")
 NAMED = re.compile(r"(hyperplanes|data_gen|benchmarks)(\.[a-z]\w*)+(:\w+|\.)?")
-"""A string that names a module, one of its objects, or where a name in braces goes on."""
+"""A string that names a module or one of its objects, or begins such a name in an f-string."""
 
 
 @cache
@@ -58,7 +58,7 @@ def unit(module):
 
 @cache
 def modules():
-    """(name, path) of every module of ours."""
+    """(name, path) of all modules of these packages."""
     paths = [path for package in OURS for path in sorted((ROOT / package).rglob("*.py"))]
     names = [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths]
     return list(zip(names, paths, strict=True))
@@ -66,9 +66,9 @@ def modules():
 
 @cache
 def examined(path):
-    """The modules of ours that a file imports, at its top, in a function or by a string; and if it says what is public.
+    """The modules that a file imports, at its top, in a function or by a string, and whether it defines `__all__`.
 
-    Its tree is not kept: the garbage collector would look at all of them again and again.
+    The syntax trees are not cached, because they would slow down garbage collection.
     """
     tree = ast.parse(path.read_text(encoding="utf-8"))
     return list(_imported(path, tree)), _says_what_is_public(path, tree)
@@ -88,7 +88,7 @@ def _imported(path, tree):
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and NAMED.fullmatch(node.value):
             name = node.value.partition(":")[0].removesuffix(".")
-            if is_module(name):  # and no group of entry points
+            if is_module(name):  # not the name of a group of entry points
                 yield name
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -115,7 +115,7 @@ def test_imports_run_down():
     wrong = []
     for name, path in modules():
         here = unit(name)
-        if name == "hyperplanes" or here is None:  # the front door names everything, lazily
+        if name == "hyperplanes" or here is None:  # the top package imports everything lazily
             continue
         for target in imported(path):
             there = unit(target) if target.split(".")[0] in OURS else None
@@ -143,11 +143,11 @@ def test_hyperplanes_never_imports_data_gen():
             assert not [target for target in imported(path) if target.split(".")[0] == "data_gen"], name
 
 
-def test_the_renderer_knows_no_field():
+def test_the_renderer_imports_no_field():
     for name, path in modules():
         if name.startswith("hyperplanes.rendering"):
             assert not [target for target in imported(path) if target.startswith("hyperplanes.fields")], name
 
 
-def test_every_module_says_what_is_public():
+def test_every_module_defines_all():
     assert [name for name, path in modules() if not examined(path)[1]] == []

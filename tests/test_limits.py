@@ -1,4 +1,4 @@
-"""What a machine does not have: memory, room on a disk, a home. Source of truth: one line that says so, exit code 2."""
+"""Missing memory, disk space or home folder. Source of truth: one line of error message and exit code 2."""
 
 import errno
 import os
@@ -37,7 +37,7 @@ def scene(tmp_path):
     return tmp_path
 
 
-def complaint(capsys):
+def error_line(capsys):
     lines = capsys.readouterr().err.strip().splitlines()
     assert "Traceback" not in "".join(lines)
     return lines[-1]
@@ -58,21 +58,21 @@ def complaint(capsys):
         (["render", "--device", "meta"], "device: expected auto, cpu or one that torch has here, got 'meta'"),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_line(options, message, scene, capsys, monkeypatch):
+def test_sizes_that_do_not_fit_into_memory_are_refused_in_one_line(options, message, scene, capsys, monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 64 * GIGABYTE)
     where = ["--checkpoint", str(scene / "model"), "--views", str(scene / "scene"), "--out", str(scene / "out")]
     assert main([*options, *where]) == 2
-    assert re.search(message, complaint(capsys))
+    assert re.search(message, error_line(capsys))
 
 
 @pytest.mark.parametrize("option", ["--devices", "--nodes"])
-def test_no_process_is_no_training(option, scene, capsys):
+def test_training_with_no_process_is_refused(option, scene, capsys):
     command = ["train", "--data", str(scene / "scene"), "--out", str(scene / "out"), option, "0"]
     assert main(command) == 2
-    assert complaint(capsys).startswith("hyperplanes train: ")
+    assert error_line(capsys).startswith("hyperplanes train: ")
 
 
-def test_memory_that_is_free_is_known_and_little_is_not_asked_for(monkeypatch):
+def test_available_memory_is_known_and_small_amounts_are_not_checked(monkeypatch):
     assert 0 < memory.available_memory() < 2**50
     monkeypatch.setattr(memory, "available_memory", lambda: 0)
     memory.require_memory("views", 3, memory.SMALL, "take fewer")
@@ -80,8 +80,8 @@ def test_memory_that_is_free_is_known_and_little_is_not_asked_for(monkeypatch):
         memory.require_memory("views", 3, 5e9, "take fewer")
 
 
-def test_files_that_the_kernel_keeps_are_free_memory(monkeypatch):
-    """A control group of 16 GiB, of which 13 of 15 that are taken are such files."""
+def test_cached_files_count_as_available_memory(monkeypatch):
+    """A control group with a limit of 16 GiB and 15 GiB in use, 13 of them for cached files."""
     files = {"max": f"{16 * 2**30}", "current": f"{15 * 2**30}", "stat": f"anon {2**31}\ninactive_file {13 * 2**30}"}
     read = Path.read_text
     monkeypatch.setattr(Path, "read_text", lambda path, **how: files.get(path.name.removeprefix("memory."), ""))
@@ -90,7 +90,7 @@ def test_files_that_the_kernel_keeps_are_free_memory(monkeypatch):
 
 
 @pytest.mark.parametrize("asked", [["--help"], ["presets", "--help"]])
-def test_a_full_disk_behind_standard_output(asked):
+def test_standard_output_to_a_full_disk_is_reported_in_one_line(asked):
     with open("/dev/full", "w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "hyperplanes", *asked], stdout=full, stderr=subprocess.PIPE, text=True, check=False
@@ -101,7 +101,7 @@ def test_a_full_disk_behind_standard_output(asked):
 
 
 def test_a_user_without_a_home_has_a_cache(monkeypatch):
-    """As in a container that is started by a number: no HOME, and no entry of that user."""
+    """As in a container that runs with a numeric user id, without HOME and without an entry in the password file."""
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)
     assert cache_folder().name == f"cache-of-{os.getuid()}"
@@ -112,20 +112,20 @@ def no_room(*_, **__):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_kernels_are_compiled_elsewhere_where_their_disk_is_full(tmp_path, monkeypatch):
+def test_kernels_are_compiled_in_another_folder_if_the_disk_is_full(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(compiling.tempfile, "TemporaryFile", no_room)
     with pytest.warns(UserWarning, match=rf"{tmp_path}.*No space left on device; kernels are compiled into (.*) for"):
         folder = Path(compiling._cache_folder.__wrapped__())
     assert folder.is_dir()
     assert not folder.is_relative_to(tmp_path)
-    compiling._remove(str(folder), os.getpid() + 1)  # as a forked process does
+    compiling._remove(str(folder), os.getpid() + 1)  # as in a forked process
     assert folder.is_dir()
     compiling._remove(str(folder), os.getpid())
     assert not folder.exists()
 
 
-def test_a_field_that_cannot_be_kept_is_there(scene, monkeypatch, capsys):
+def test_a_field_that_cannot_be_cached_is_returned(scene, monkeypatch, capsys):
     monkeypatch.setattr(fields, "WORTH_KEEPING", -1.0)
     monkeypatch.setattr("hyperplanes.adaptation.kept.keep_field", no_room)
     model, views = HyperPlanes.from_pretrained(scene / "model"), read_views(scene / "scene")
@@ -144,12 +144,12 @@ def test_densities_below_zero_are_refused():
 
 
 @pytest.mark.parametrize("rate", [1e3, 1e30])
-def test_fine_tuning_at_a_wild_rate_is_refused(scene, rate):
-    """At the one rate weights lose everything, at the other they are no numbers any more."""
+def test_fine_tuning_with_a_too_high_rate_is_refused(scene, rate):
+    """With the lower rate pictures become empty, with the higher one weights become NaN."""
     model, views = HyperPlanes.from_pretrained(scene / "model"), read_views(scene / "scene")
     settings = FineTuning(optimiser="adam", learning_rate=rate, rays=64)
     with pytest.raises(NoProgressError, match=r"fine-tuning: expected 5 steps to lower .*; lower learning_rate and"):
         model.fine_tune(views, 5, settings)
-    if rate == 1e3:  # a table of methods counts what it made all the same
+    if rate == 1e3:  # tables of methods use the result anyway
         empty = Unchecked(FineTuned(model, 5, settings)).adapt(views).render(views[:1].cameras).images
         assert torch.isfinite(empty).all()

@@ -1,4 +1,4 @@
-"""Source of truth: what was there before a command that fails, or is refused, is there after it, byte by byte."""
+"""Source of truth: files from before a command that fails or is refused, which must not change."""
 
 import errno
 import json
@@ -27,7 +27,7 @@ def demo(tmp_path):
     return tmp_path / "demo"
 
 
-def test_results_do_not_replace_what_they_are_made_of(demo, tmp_path, capsys):
+def test_results_do_not_replace_their_inputs(demo, tmp_path, capsys):
     model, scene = demo / "hyperplanes", first_object(demo)
     llff(tmp_path / "llff")
     render = ["render", "--checkpoint", str(model), "--views"]
@@ -50,7 +50,7 @@ def test_results_do_not_replace_what_they_are_made_of(demo, tmp_path, capsys):
         assert files(tmp_path) == before, command
 
 
-def test_one_broken_object_does_not_cost_the_results_of_the_others(demo, tmp_path, capsys):
+def test_a_broken_object_does_not_lose_the_results_of_the_others(demo, tmp_path, capsys):
     names = json.loads((demo / "data/manifest.json").read_text())["splits"]["test"]
     (demo / "data" / names[-1] / "transforms.json").write_text("{")
     command = ["evaluate", "--data", str(demo / "data"), "--method", "nearest_view", "hull_blend"]
@@ -79,7 +79,7 @@ def test_the_table_is_shown_before_it_is_written(demo, tmp_path, capsys, monkeyp
 
 
 def test_files_that_a_killed_process_left_half_written_are_removed(tmp_path):
-    """A process that has ended, this one, and one inside a folder that somebody else has locked."""
+    """Files of an ended process, of this process, and of one in a folder that another process has locked."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     (tmp_path / "best").mkdir()

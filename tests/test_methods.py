@@ -1,6 +1,4 @@
-"""Sources of truth: the names of DESIGN and README, query views filled with NaN that no method may read, and updates of
-other objects swapped by hand.
-"""
+"""Sources of truth: the documented names, query views filled with NaN, and updates of objects swapped by hand."""
 
 from dataclasses import replace
 from functools import partial
@@ -63,7 +61,7 @@ def test_methods_by_name(folders):
     assert made["hyperplanes"].hypernetwork is not None
 
 
-def test_methods_do_without_reflections_where_they_are_told_to():
+def test_methods_use_no_reflections_if_they_are_off():
     packaged = {"hyperplanes": find_checkpoint(Path("small"))}
     for reflections in (True, False):
         made = make_method(Request("hyperplanes", packaged, reflections=reflections))
@@ -96,12 +94,12 @@ def test_missing_checkpoints_are_named(name, family):
 
 
 @pytest.mark.parametrize("name", ["mv_meta_2", "maml", "standard", "mv_shuffled"])
-def test_of_a_learned_initialisation_only_the_weights_are_optimised(folders, name):
+def test_learned_initialisations_optimise_only_the_weights(folders, name):
     with pytest.raises(ValueError, match=f"fine_tune: expected weights for {name}, .*, got hypernetwork"):
         make_method(Request(name, folders, settings=FineTuning(trainable="hypernetwork")))
 
 
-def test_every_method_in_words():
+def test_every_method_has_its_own_description():
     names = [f"{name}_100" if name.endswith("scratch") else name for name in METHODS]
     names += ["hyperplanes_100", "hyperplanes_auto", "point_multiplane_10", "mv_meta_10"]
     words = {name: describe_method(name) for name in names}
@@ -110,7 +108,7 @@ def test_every_method_in_words():
     assert words["hyperplanes_auto"] == "HyperPlanes after a number of fine-tuning steps chosen by held-out views"
 
 
-def test_a_row_for_each_number_of_steps():
+def test_names_of_methods_at_several_numbers_of_steps():
     assert at_steps("scratch", [0, 10, 100]) == ["scratch_10", "scratch_100"]
     assert at_steps("nearest_view", [0, 10]) == ["nearest_view"]
     assert at_steps("hyperplanes_5", [0, 10]) == ["hyperplanes_5"]
@@ -119,7 +117,7 @@ def test_a_row_for_each_number_of_steps():
     assert at_steps("mv_meta", [0, 10]) == ["mv_meta_0", "mv_meta_10"]
 
 
-def test_swapped_objects_have_the_update_of_the_next_one_and_everything_else_of_their_own():
+def test_a_swapped_object_has_only_the_update_of_the_next_one():
     data, model = Balls(test=3), awaken(small_model()).eval()
     supports = [data.task(name).support for name in data.names("test")]
     swapped = Swapped(model, supports)
@@ -134,7 +132,7 @@ def test_swapped_objects_have_the_update_of_the_next_one_and_everything_else_of_
             assert not torch.equal(found, unswapped)
 
 
-def test_an_object_in_another_precision_has_the_update_of_another_one_too():
+def test_swapping_works_for_an_object_in_another_precision():
     data, model = Balls(test=2), awaken(small_model()).eval()
     supports = [data.task(name).support for name in data.names("test")]
     swapped, precise = Swapped(model, supports), supports[0].to(dtype=torch.float64)
@@ -152,18 +150,18 @@ def test_swapping_takes_two_objects_and_a_hypernetwork():
 
 
 def test_no_method_reads_a_pixel_of_the_query_views(folders, monkeypatch):
-    # Source of truth: NaN in the query images would reach the picture of whatever reads them.
+    # NaN in the query images would be in the pictures of a method that reads them.
     quick = PRESETS["quick"]
     monkeypatch.setitem(PRESETS, "quick", replace(quick, model=small_model(hypernetwork=None).config))
     monkeypatch.setattr(methods, "HullBlend", partial(HullBlend, side=8, steps=16))
-    monkeypatch.setattr(judging_symmetry, "MOST_PIXELS", 2 * 4 * 12 * 12)  # room for the reflections about one plane
+    monkeypatch.setattr(judging_symmetry, "MOST_PIXELS", 2 * 4 * 12 * 12)  # enough for the reflections about one plane
     clean, data = Balls(test=2, size=(12, 12)), Balls(test=2, size=(12, 12))
     original, read = data.task, []
 
     def poisoned(name):
         task = original(name)
         query = replace(task.query[:1], images=torch.zeros(1, 3, 12, 12))
-        query.images.fill_(torch.nan)  # past the check of Views
+        query.images.fill_(torch.nan)  # after the check of Views
         return replace(task, query=query)
 
     data.task = poisoned

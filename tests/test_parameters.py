@@ -18,7 +18,7 @@ def test_parameters_are_shared_with_their_module():
     assert theta["fine.bias"] is module["fine"].bias
 
 
-def test_an_update_shifts_what_it_names_and_shares_the_rest():
+def test_an_update_changes_only_the_tensors_that_it_names():
     theta = Parameters.of(network())
     before = theta["fine.bias"].clone()
     shifted = theta + {"fine.bias": torch.ones(3)}
@@ -28,7 +28,7 @@ def test_an_update_shifts_what_it_names_and_shares_the_rest():
     assert isinstance(shifted, Parameters)
 
 
-def test_nothing_and_zero_change_nothing():
+def test_empty_and_zero_updates_change_nothing():
     theta = Parameters.of(network())
     for update in ({}, {name: torch.zeros_like(value) for name, value in theta.items()}):
         assert all(torch.equal(value, theta[name]) for name, value in (theta + update).items())
@@ -40,20 +40,20 @@ def test_gradients_reach_both_terms():
     assert theta.grad.tolist() == update.grad.tolist() == [4.0, 4.0]
 
 
-def test_misfits_are_refused():
+def test_updates_of_other_names_or_shapes_are_refused():
     theta = Parameters.of(network())
     with pytest.raises(ValueError, match="update: expected names among .*, got 'medium.bias'"):
         theta + {"medium.bias": torch.ones(3)}
     with pytest.raises(ValueError, match=r"update of fine.bias: expected \(3,\), got \(1,\)"):
-        theta + {"fine.bias": torch.ones(1)}  # would broadcast silently
+        theta + {"fine.bias": torch.ones(1)}  # it would be broadcast
 
 
-def test_a_part_is_named_from_its_own_root():
+def test_names_in_a_part_are_relative_to_the_part():
     theta = Parameters({"fine.colour.bias": torch.ones(1), "finer.colour.bias": torch.zeros(1), "fine": torch.zeros(1)})
     assert {name: value.item() for name, value in theta.under("fine").items()} == {"colour.bias": 1.0}
 
 
-def test_detached_parameters_have_no_history():
+def test_detached_parameters_require_no_gradient():
     theta = Parameters.of(network()).detach()
     assert isinstance(theta, Parameters)
     assert not any(value.requires_grad for value in theta.values())

@@ -1,4 +1,4 @@
-"""Source of truth: what `scripts/setup` asks a pip for that installs nothing and notes it."""
+"""Source of truth: the arguments with which `scripts/setup` calls a fake pip, which records them."""
 
 import os
 import shutil
@@ -19,7 +19,7 @@ esac
 PYTHON = """#!/bin/sh
 [ "$1" = -m ] && echo "$2" >> "$ASKED.run"
 [ "$1" != -c ]
-"""  # cannot import torch
+"""  # a Python that cannot import torch
 
 
 def script(path, text):
@@ -38,7 +38,7 @@ def script(path, text):
     ],
     ids=["from the index", "from PyTorch's index", "CUDA for want of it", "CUDA for a GPU"],
 )
-def test_the_cpu_build_of_torch_is_looked_for_and_what_comes_is_said(reached, gpu, asked, said, tmp_path):
+def test_setup_looks_for_the_cpu_build_of_torch_and_prints_what_it_installs(reached, gpu, asked, said, tmp_path):
     root, log = tmp_path / "project", tmp_path / "asked"
     script(root / "scripts/setup", (ROOT / "scripts/setup").read_text())
     shutil.copy(ROOT / "constraints.txt", root)

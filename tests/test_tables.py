@@ -1,4 +1,4 @@
-"""Every table and figure of the pages is one that `python -m benchmarks all` makes."""
+"""`python -m benchmarks all` makes every table and figure of the documentation."""
 
 import re
 import subprocess
@@ -13,7 +13,7 @@ from benchmarks import tables
 
 @pytest.fixture
 def commands(monkeypatch):
-    """What `all` runs where everything is given."""
+    """The commands that `all` runs if all of its options are given."""
     ran = []
     run = types.SimpleNamespace(returncode=0)
     monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)
@@ -24,7 +24,7 @@ def commands(monkeypatch):
 
 
 def test_all_makes_the_rows_of_every_table_and_every_figure_of_the_pages(commands):
-    """Source of truth: the markers and the links of README and docs."""
+    """Source of truth: the markers and links in README.md and docs."""
     pages = "".join(page.read_text(encoding="utf-8") for page in tables.PAGES)
     names = [name for _, name, _ in tables.MARKED.findall(pages)]
     wanted = {f"{each}.json" for name in names for each in tables.SOURCES.get(name, (name,))}
@@ -35,8 +35,8 @@ def test_all_makes_the_rows_of_every_table_and_every_figure_of_the_pages(command
     assert wanted <= made
 
 
-def test_the_short_way_leaves_the_rows_of_the_pages_alone(monkeypatch):
-    """Property: with --quick nothing goes to the folder of results."""
+def test_quick_benchmarks_do_not_replace_results(monkeypatch):
+    """Property: with --quick, nothing is written to the folder of results."""
     ran = []
     run = types.SimpleNamespace(returncode=0)
     monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)

@@ -1,4 +1,4 @@
-"""Source of truth: the notebooks of docs/tutorials, whose cells run as they stand there."""
+"""Source of truth: the notebooks in docs/tutorials, whose cells are run as they are."""
 
 import json
 import shlex
@@ -25,13 +25,13 @@ def test_the_tutorial_runs(path, tmp_path, monkeypatch):
     names = {}
     with rendered_here(), small_packaged(residuals=False):
         for cell in cells(path):
-            code, _, command = cell.partition("!hyperplanes ")  # what follows goes to the shell in a notebook
+            code, _, command = cell.partition("!hyperplanes ")  # a notebook runs the rest in the shell
             exec(code, names)
             if command:
                 assert main(shlex.split(command.format(**names))) == 0, cell
 
 
-def test_notebooks_carry_no_output():
+def test_notebooks_contain_no_output():
     for path in TUTORIALS:
         document = json.loads(path.read_text(encoding="utf-8"))
         assert not any(cell.get("outputs") for cell in document["cells"]), path

@@ -1,4 +1,4 @@
-"""Source of truth: jaxtyping and beartype alone, on every call; checks of one call a kind must agree with them."""
+"""Source of truth: jaxtyping and beartype on every call; checking one call of each kind must give the same results."""
 
 import jaxtyping
 import numpy as np
@@ -24,7 +24,7 @@ def outcome(function, *given):
         return type(error)
 
 
-def test_calls_are_refused_as_they_are_where_each_is_checked():
+def test_the_same_calls_are_refused_as_with_a_check_of_every_call():
     once, always = checked_once(rows, wrap), wrap(rows)
     sizes = (5, 100, 5, 20, 100, 3, 16, 15)
     calls = [(torch.ones(size, 3), torch.ones(size)) for size in sizes]
@@ -42,7 +42,7 @@ def test_calls_are_refused_as_they_are_where_each_is_checked():
     assert outcome(always, *calls[8]) is jaxtyping.TypeCheckError
 
 
-def test_a_wrong_result_of_a_call_that_was_seen_is_refused_and_nothing_is_called_twice():
+def test_a_wrong_result_of_a_known_call_is_refused_and_nothing_is_called_twice():
     once = checked_once(rows, wrap)
     points, weights = torch.ones(30, 3), torch.ones(30)
     once(points, weights, torch.ones(30, 3))

@@ -58,7 +58,7 @@ def test_chosen_views_keep_their_cameras_masks_and_names(index, chosen):
         ([True, False], "views: expected 4 booleans, one each, got 2"),
     ],
 )
-def test_what_chooses_no_views_is_refused_in_one_sentence(index, message):
+def test_indices_of_other_types_or_out_of_range_are_refused(index, message):
     with pytest.raises(ValueError, match=message):
         views()[index]
 
@@ -79,7 +79,7 @@ def test_rays_go_row_by_row_through_the_pixels_of_one_view():
     rays = whole.rays(2)
     assert len(rays) == 6 * 9
     torch.testing.assert_close(rays.origins, centres(whole.cameras)[2].expand(54, 3))
-    # seen from its own camera, the ray of row 4, column 7 comes from pixel (7, 4)
+    # points on the ray of row 4, column 7 project to pixel (7, 4) of the same camera
     point = rays.at(torch.full((54,), 2.5))[4 * 9 + 7]
     pixel = select(whole.cameras, [2]).project(point[None, None])
     torch.testing.assert_close(pixel.flatten(), torch.tensor([7.0, 4.0]), atol=1e-4, rtol=0)
@@ -136,7 +136,7 @@ def test_views_in_another_precision_and_their_memory():
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_halves_keep_the_size_of_the_pictures(dtype):
+def test_half_precision_keeps_the_size_of_the_images(dtype):
     half = views((6, 2049)).to(dtype=dtype)
     assert half.images.dtype == half.cameras.intrinsics.dtype == dtype
     assert image_size(half.cameras) == half.size
@@ -152,14 +152,14 @@ def test_rays_go_through_the_pixels_whose_colours_they_have_in_any_precision():
 
 
 @pytest.mark.parametrize("dtype", [torch.int32, torch.uint8, torch.bool])
-def test_there_are_no_views_of_whole_numbers(dtype, tmp_path):
+def test_integer_types_of_views_are_refused(dtype, tmp_path):
     for call in (views().to, lambda dtype: small_model().save(tmp_path, dtype)):
         with pytest.raises(ValueError, match=f"dtype: expected a floating-point type, got {dtype}"):
             call(dtype=dtype)
     assert not list(tmp_path.iterdir())
 
 
-def test_pictures_have_a_pixel_at_least():
+def test_sizes_below_one_pixel_are_refused():
     for no_size in (0, -5):
         with pytest.raises(ValueError, match=f"longest: expected at least 1 pixel, got {no_size}"):
             views().resized(no_size)
@@ -168,7 +168,7 @@ def test_pictures_have_a_pixel_at_least():
                 change(views().cameras, no_size, 4)
 
 
-def test_no_pixel_to_draw_from_is_refused():
+def test_drawing_rays_from_no_pixels_is_refused():
     with pytest.raises(ValueError, match="among: expected at least one pixel of 4 views to draw rays from, got none"):
         views().sample_rays(3, among=torch.zeros(0, dtype=torch.long))
     for wrong in (216, -1):
@@ -207,7 +207,7 @@ def test_rays_through_pixels_are_those_of_their_view():
         ),
     ],
 )
-def test_what_does_not_fit_together_is_refused(change, message):
+def test_parts_of_other_shapes_are_refused(change, message):
     whole = views()
     parts = {"images": whole.images, "cameras": whole.cameras, "masks": whole.masks, "names": NAMES}
     with pytest.raises(ValueError, match=message):
@@ -216,8 +216,8 @@ def test_what_does_not_fit_together_is_refused(change, message):
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("size", [(5, 1), (3, 1), (1, 3), (3, 4), (3, 3)])
-def test_dimensions_are_told_by_the_size_of_the_cameras(size):
-    """As PyTorch documents (N, C, H, W): by place, however small they are; channels last are refused where it shows."""
+def test_the_size_of_the_cameras_determines_which_dimension_is_which(size):
+    """Images are (N, C, H, W) as in PyTorch, also if small; channels last are refused if the shape shows it."""
     cameras, images = ring(2, size), torch.rand(2, 3, *size)
     assert Views(images, cameras).size == size
     if size[0] != 3 or size[1] != 3:
@@ -244,8 +244,8 @@ def test_a_task_names_its_object():
         (lambda images: None, "got None"),
     ],
 )
-def test_pictures_that_are_none_are_refused_where_they_enter(images, found):
-    """Property: what would have been drawn as white pictures never gets to the model."""
+def test_values_that_are_no_images_are_refused_by_views(images, found):
+    """Property: images that would be rendered as white never reach the model."""
     picture = torch.linspace(0, 1, 2 * 3 * 4 * 4).reshape(2, 3, 4, 4)
     cameras = ring(2, (4, 4))
     with pytest.raises(ValueError, match=f"^images: .*{found}"):

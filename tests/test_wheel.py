@@ -1,4 +1,4 @@
-"""Source of truth: the wheel itself, built from a copy of the tree, and setup.cfg that says what goes into it."""
+"""Source of truth: a wheel that is built from a copy of the repository."""
 
 import shutil
 import subprocess
@@ -14,7 +14,7 @@ PACKAGED = ("hyperplanes/pretrained/tiny/model.json", "hyperplanes/pretrained/ti
 
 
 def copy_without_weights(source, target):
-    """A file, or an empty one in the place of weights: compressing them takes as long as all else."""
+    """Copy a file; weights become empty files, because compressing them takes half of the time."""
     if source.endswith(".safetensors"):
         Path(target).touch()
     else:
@@ -40,7 +40,7 @@ def wheel(tmp_path_factory):
     return zipfile.ZipFile(path)
 
 
-def test_it_holds_the_packages_and_nothing_else(wheel):
+def test_the_wheel_contains_the_packages_and_nothing_else(wheel):
     found = {name for name in wheel.namelist() if ".dist-info/" not in name}
     there = {
         str(path.relative_to(ROOT))
@@ -55,14 +55,14 @@ def test_it_holds_the_packages_and_nothing_else(wheel):
     assert found == there | page | {*PACKAGED} | models | examples
 
 
-def test_the_example_is_whole_and_small(wheel):
-    """What the README's first lines read, so that they run from the wheel alone: 50 views in less than 300 KiB."""
+def test_the_example_is_complete_and_small(wheel):
+    """The first example of README.md needs 50 views, which take less than 300 KiB."""
     files = [entry for entry in wheel.infolist() if entry.filename.startswith("hyperplanes/examples/example-car/")]
     assert sum(entry.filename.endswith(".png") for entry in files) == 50
     assert sum(entry.file_size for entry in files) < 300 * 2**10
 
 
-def test_its_metadata(wheel):
+def test_metadata_of_the_wheel(wheel):
     name = next(name for name in wheel.namelist() if name.endswith("METADATA"))
     metadata = wheel.read(name).decode()
     assert "License-Expression: Apache-2.0" in metadata

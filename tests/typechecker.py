@@ -1,8 +1,8 @@
-"""The checker behind the import hook in conftest.py: beartype, with ints allowed where floats are, as PEP 484 says.
+"""The type checker of the import hook in conftest.py: beartype, which accepts ints for floats, as in PEP 484.
 
-Each kind of call is checked once. A check costs a quarter of a millisecond, and a training makes thousands of calls of
-a few kinds: calls are of one kind where their arguments and results have the same classes and dtypes, the same small
-sizes, and larger sizes that are equal to each other in the same places.
+Each kind of call is checked once, because a check takes a quarter of a millisecond and a training makes thousands of
+calls of a few kinds. Two calls are of the same kind if their arguments and results have the same classes, dtypes and
+small sizes, and their large sizes are equal to each other in the same places.
 """
 
 import functools
@@ -18,14 +18,14 @@ from beartype import BeartypeConf, beartype
 check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 SHAPES = ("Float[", "Int[", "Int32[", "Bool[", "UInt8[")
 NAMED = 16
-"""Sizes below are told apart, as annotations name some of them, `"point 3"`; those above are known by their order."""
+"""Sizes below this are compared by value, because annotations may name them (`"point 3"`); larger ones by order."""
 
 
 def install(package):
-    """Check the functions of a package whose signature has shapes, and its classes that have any.
+    """Check the functions of a package whose signatures have shapes, and its dataclasses whose fields have shapes.
 
-    The others are pyright's. Functions inside others are left alone, too: they would be compiled anew, in a millisecond
-    each, whenever these are called.
+    All others are checked by pyright. Nested functions are not checked, because their checks would be compiled in a
+    millisecond at each call of the outer function.
     """
     jaxtyping.jaxtyped = functools.partial(_checked, jaxtyping.jaxtyped)
     jaxtyping.install_import_hook(package, "typechecker.check")
@@ -51,8 +51,8 @@ def _checked(original, *, typechecker):
 
 
 def checked_once(function, wrap):
-    """A function that is called through `wrap(function)` where a call of this kind has not been seen."""
-    seen, made, held, this_thread = set(), {}, {}, threading.get_ident  # checks take a millisecond to make: when needed
+    """A function that calls `wrap(function)` for the first call of each kind, and `function` afterwards."""
+    seen, made, held, this_thread = set(), {}, {}, threading.get_ident  # made when needed, in a millisecond each
 
     def checked():
         if "function" not in made:
@@ -60,12 +60,12 @@ def checked_once(function, wrap):
         return made["function"]
 
     def check_result(result, given, named):
-        """The same checks, around a result that is there."""
+        """Check a result without calling the function again."""
 
         def returned(*_, **__):
             return held[this_thread()]
 
-        if "result" not in made:  # with the names that the annotations are made of
+        if "result" not in made:  # with the globals that the annotations refer to
             again = types.FunctionType(
                 returned.__code__, function.__globals__, function.__name__, None, returned.__closure__
             )
@@ -97,13 +97,13 @@ def checked_once(function, wrap):
 
 @functools.cache
 def form(cls):
-    """How `kind` describes what is of a class: looked up once a class, as calls have a thousand arguments a step."""
+    """How `kind` describes values of a class; cached, because a training step has a thousand arguments."""
     forms = {"array": (torch.Tensor, np.ndarray), "sequence": (tuple, list), "mapping": dict, "text": str}
     return next((name for name, classes in forms.items() if issubclass(cls, classes)), "other")
 
 
 def kind(value, sizes):
-    """What a check of this value depends on; large sizes by the order in which they come, which `sizes` holds."""
+    """The properties of a value that its check depends on; `sizes` numbers large sizes in order of appearance."""
     cls = type(value)
     shaped = form(cls)
     if shaped == "other":

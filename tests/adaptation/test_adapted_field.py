@@ -20,7 +20,7 @@ SOLID = Sphere(radius=0.5)
 
 
 def solid_ball(points, directions):
-    """A ball of radius 0.5 with a hard surface, coloured by place and direction."""
+    """A ball of radius 0.5 with a hard surface, whose colour depends on position and direction."""
     colour = (0.5 + 0.4 * torch.sin(3 * points) + 0.1 * directions).clamp(0, 1)
     return colour, 30.0 * (points.norm(dim=-1) < 0.5)
 
@@ -32,7 +32,7 @@ def adapted(sampling=None, bounds=None, side=16):
 @pytest.mark.parametrize("sampling", [RayMarching(60, 1e-6), Hierarchical(48, 0), Hierarchical(24, 24)])
 @pytest.mark.parametrize("size", [(9, 14), (14, 9)])
 @torch.no_grad()
-def test_a_picture_is_what_its_rays_see(sampling, size):
+def test_pictures_agree_with_traced_rays(sampling, size):
     cameras, field = ring(2, size), adapted(sampling)
     pictures = field.render(cameras, sampling, antialias=False)
     assert pictures.images.shape == (2, 3, *size)
@@ -46,7 +46,7 @@ def test_a_picture_is_what_its_rays_see(sampling, size):
 
 
 @torch.no_grad()
-def test_pictures_are_marched_with_five_samples_for_three_where_100_pixels_show_the_scene():
+def test_the_number_of_steps_of_pictures_grows_with_the_root_of_the_pixels():
     sampling = RayMarching(48, 0.0)
     assert [sampling.for_rendering(pixels).steps for pixels in (12, 100, 400)] == [40, 80, 160]
     cameras, field = ring(2, (12, 12)), adapted(sampling)
@@ -57,7 +57,7 @@ def test_pictures_are_marched_with_five_samples_for_three_where_100_pixels_show_
 def test_one_pixel_against_the_loop():
     cameras = camera_at((0.0, 0.0, 3.0), (5, 5))
     pictures = adapted(Hierarchical(40, 0)).render(cameras)
-    # the middle pixel looks along -z from 2 to 4 away: 40 intervals of 0.05
+    # the ray of the middle pixel goes along -z from distance 2 to 4: 40 intervals of 0.05
     edges = [2 + 0.05 * index for index in range(41)]
     points = torch.tensor([[0.0, 0.0, 3 - (a + b) / 2] for a, b in zip(edges, edges[1:], strict=False)])
     colour, density = solid_ball(points, torch.tensor([[0.0, 0.0, -1.0]]).expand(40, 3))
@@ -69,8 +69,8 @@ def test_one_pixel_against_the_loop():
 
 
 @torch.no_grad()
-def test_a_solid_ball_looks_like_one():
-    # pictures of the ball by geometry alone: covered where the ray hits it, the depth that of the hit
+def test_pictures_of_a_solid_ball_agree_with_its_geometry():
+    # closed form: opaque where the ray hits the ball, with the depth of the hit
     cameras = ring(2, (20, 20))
     pictures, truth = adapted(RayMarching(150)).render(cameras), ball_views(cameras)
     inner = -torch.nn.functional.max_pool2d(-truth.masks, 3, 1, 1) > 0
@@ -108,7 +108,7 @@ def test_a_scene_moved_and_scaled_with_its_cameras_gives_the_same_picture(sampli
 
 
 @torch.no_grad()
-def test_each_view_is_rendered_by_itself():
+def test_views_are_rendered_independently():
     one, other = camera_at((0.0, 0.5, 3.0)), camera_at((2.0, 1.0, 2.0))
     field = adapted()
     both = field.render(concatenate([one, other]))
@@ -128,7 +128,7 @@ def test_a_camera_inside_the_bounds_sees_what_is_ahead():
 
 
 @torch.no_grad()
-def test_an_empty_hull_is_a_white_picture():
+def test_an_empty_hull_gives_a_white_picture():
     nothing = Occupancy(torch.zeros(8, 8, 8, dtype=torch.bool), Sphere())
     pictures = AdaptedField(solid_ball, nothing, RayMarching()).render(ring(2))
     assert (pictures.images == 1).all()
@@ -136,7 +136,7 @@ def test_an_empty_hull_is_a_white_picture():
 
 
 @torch.no_grad()
-def test_another_protocol_can_be_asked_for():
+def test_another_protocol_can_be_chosen():
     field = adapted(RayMarching(60))
     pictures = field.render(ring(1, (8, 8)), sampling=Hierarchical(10, 6))
     assert pictures.samples == 64 * (10 + 10 + 6)
@@ -158,7 +158,7 @@ def test_pictures_carry_no_gradients_but_traces_do():
 
 
 @torch.no_grad()
-def test_it_answers_as_its_field():
+def test_calling_an_adapted_field_calls_its_field():
     points, directions = torch.rand(7, 3), torch.rand(7, 3)
     for mine, own in zip(adapted()(points, directions), solid_ball(points, directions), strict=True):
         assert torch.equal(mine, own)
@@ -169,7 +169,7 @@ def ball_surface(radius):
     return radius * points / points.norm(dim=1, keepdim=True)
 
 
-def test_the_hull_holds_the_object_and_is_everything_without_masks():
+def test_the_hull_contains_the_object_and_is_full_without_masks():
     views = ball_views(ring(6, (32, 32)), bounds=Sphere((0.1, 0.0, 0.0), 1.2))
     carved = hull(views, 24)
     assert carved.contains(ball_surface(0.49)).all()
@@ -204,12 +204,12 @@ def test_cameras_in_double_precision_see_the_same(sampling):
     assert ((single.images - double.images).abs().amax(1) < 1e-3).float().mean() > 0.97
 
 
-def test_masks_that_leave_nothing_are_named():
+def test_masks_with_an_empty_hull_are_refused():
     views = replace(ball_views(ring(3)), names=("front", "side", "back"))
     blank = replace(views, masks=torch.zeros_like(views.masks))
     with pytest.raises(ValueError, match=r"masks of the support views \(front to back\): expected an object, got none"):
         hull(blank, 8)
-    # each camera sees something, but none of it lies within the bounds
+    # each mask has a pixel set, but no voxel within the bounds projects to all of them
     apart = torch.zeros_like(views.masks)
     apart[0, 0, 0, 0] = apart[1, 0, -1, -1] = apart[2, 0, 0, -1] = 1.0
     with pytest.raises(ValueError, match="got 3 of 3 with a pixel set, and no point that all of them may show; check"):
@@ -227,7 +227,7 @@ def test_rays_without_gradients_show_the_same(sampling):
 
 
 @torch.no_grad()
-def test_pictures_follow_weights_and_voxels_that_change_in_place():
+def test_pictures_change_with_in_place_changes_of_weights_and_voxels():
     views = ball_views(ring(4))
     field, cameras = awaken(small_model()).eval().adapt(views), ring(1, shift=1)
     before, bias = field.render(cameras).opacity, field.field.parameters["density.bias"]

@@ -1,4 +1,4 @@
-"""Source of truth: what must not matter (order, what else is in a batch), and views that a step may not be shown."""
+"""Sources of truth: invariances (order of views, other objects in a batch), and which views a gradient step reads."""
 
 import copy
 from dataclasses import replace
@@ -34,7 +34,7 @@ CONFIG = ModelConfig("image_based", NETWORK, SHAPE, sampling=RayMarching(24), hu
 
 
 def model(**changes):
-    torch.manual_seed(0)  # what `awaken` draws from
+    torch.manual_seed(0)  # `awaken` draws from the global generator
     return awaken(HyperPlanes(replace(CONFIG, **changes))).eval()
 
 
@@ -57,12 +57,12 @@ def test_any_number_of_views_in_any_order_makes_the_same_picture(count, reader):
         torch.testing.assert_close(picture(adapter, support[order]), expected, atol=1e-5, rtol=1e-4)
 
 
-def test_larger_pictures_carve_a_finer_hull():
+def test_larger_images_give_a_finer_hull():
     sides = []
     for size in ((16, 16), (20, 40), (300, 200)):
         task = ball_views(ring(4, size))
         sides.append(model().prepare(task).occupancy.occupied.shape[0])
-    assert sides == [16, 30, 192]  # as configured, three quarters of the longer side, and the most
+    assert sides == [16, 30, 192]  # the configured side, three quarters of the longer side, and the maximum
     assert model().prepare(replace(task, masks=None)).occupancy.occupied.shape[0] == 16
 
 
@@ -83,7 +83,7 @@ def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch(no
 @pytest.mark.parametrize("normalisation", ["group", "batch", "batch_statistics"])
 @pytest.mark.parametrize("training", [False, True])
 @torch.no_grad()
-def test_images_that_are_not_there_count_in_no_statistics(normalisation, training):
+def test_padding_images_do_not_change_batch_statistics(normalisation, training):
     network = model(hypernetwork=replace(SHAPE, normalisation=normalisation)).hypernetwork.train(training)
     generator = torch.Generator().manual_seed(0)
     images, directions = torch.rand(2, 3, 3, 32, 32, generator=generator), torch.rand(2, 3, 3, generator=generator)
@@ -105,7 +105,7 @@ def test_a_model_of_planes_reads_objects_of_several_picture_sizes():
             torch.testing.assert_close(one["fine.density.weight"], adapter.update(each)["fine.density.weight"])
 
 
-def test_the_hypernetwork_reads_the_views_that_stand_farthest_apart():
+def test_the_hypernetwork_reads_the_views_that_are_farthest_apart():
     chosen = views(8)[model().prepare(views(8)).hyperplanes]
     standing = torch.nn.functional.normalize(centres(chosen.cameras), dim=1)
     assert len(chosen) == 3
@@ -161,16 +161,16 @@ def test_the_grid_of_an_object_is_that_of_its_own_volume():
     assert torch.equal(adapter.prepare(views(3), carved=False).volume, adapter.prepare(views(3)).volume)
 
 
-def test_fields_that_know_views_by_their_places_have_no_use_for_a_volume():
+def test_fields_with_fixed_planes_refuse_a_volume_hypernetwork():
     with pytest.raises(ValueError, match="hypernetwork.kind: expected one that reads images"):
         HyperPlanes(replace(CONFIG, target="point_multiplane", network=PLACED, hypernetwork=VOLUME))
 
 
 HAZE = 5.0
-"""Less of the density's bias: so little of the ball is left that it hides nothing."""
+"""Subtracted from the bias of the density, so that the ball is too transparent to occlude anything."""
 
 
-def test_colours_are_taken_from_views_that_see_the_surface_of_the_density_and_not_of_the_hull():
+def test_visibility_is_decided_by_the_surface_of_the_density_not_of_the_hull():
     adapter, support = model(**READERS["volume"]), views(6)
     with torch.no_grad():
         adapter.targets["fine"].density.bias.sub_(HAZE)
@@ -186,7 +186,7 @@ def test_colours_are_taken_from_views_that_see_the_surface_of_the_density_and_no
         torch.testing.assert_close(tuned.render(ring(2, (10, 13), shift=1)).images, expected)
 
 
-def test_the_control_of_swapped_updates_judges_views_by_its_own_surface():
+def test_swapped_updates_use_the_surface_of_their_own_density():
     adapter = model(**READERS["volume"])
     with torch.no_grad():
         adapter.targets["fine"].density.bias.sub_(HAZE)
@@ -202,7 +202,7 @@ def test_the_control_of_swapped_updates_judges_views_by_its_own_surface():
 
 
 class Recorder:
-    """A field of one variable that notes what it was not shown, and where rays come from."""
+    """A field with one variable that records which views are masked, and from which views rays come."""
 
     def __init__(self, support):
         self.value = torch.zeros(3, requires_grad=True)
@@ -222,7 +222,7 @@ class Recorder:
         return field
 
 
-def test_of_two_views_one_is_hidden_from_the_rays_of_the_other():
+def test_with_two_views_the_view_of_the_rays_is_masked():
     recorder = Recorder(views(2))
     list(recorder.descent(views(2), FineTuning(rays=16)).run(8))
     assert all(hidden == sources and len(hidden) == 1 for hidden, sources in recorder.notes)
@@ -246,11 +246,11 @@ def test_rays_come_from_hidden_views_only(among, draw):
     settings = FineTuning(rays=64, holdout=4, draw=draw)
     assert list(recorder.descent(support, settings, pixels).run(8))[-1] == 8
     assert all(sources <= hidden and len(hidden) == 3 for hidden, sources in recorder.notes)
-    assert len(set.union(*(hidden for hidden, _ in recorder.notes))) > 6  # others in every step
+    assert len(set.union(*(hidden for hidden, _ in recorder.notes))) > 6  # the masked views differ between steps
 
 
 @pytest.mark.parametrize(("count", "settings"), [(1, FineTuning(rays=16)), (12, FineTuning(rays=16, mask_views=False))])
-def test_a_single_view_and_who_does_not_want_it_hide_none(count, settings):
+def test_no_view_is_masked_with_a_single_view_or_without_mask_views(count, settings):
     recorder = Recorder(views(count))
     list(recorder.descent(views(count), settings).run(3))
     assert [hidden for hidden, _ in recorder.notes] == [None] * 3
@@ -275,7 +275,7 @@ def test_fine_tuning_improves_new_views_and_leaves_the_model_as_it_is(reader, fr
     assert all(torch.equal(value, before[name]) for name, value in adapter.state_dict().items())
 
 
-def test_steps_from_nothing_but_fresh_weights_are_those_from_random_ones():
+def test_steps_with_a_fresh_share_of_1_start_from_random_weights():
     adapter, support = model(**READERS["volume"]), views(4)
     cameras = ring(2, (10, 13), shift=1)
     fresh = adapter.fine_tune(support, 3, FineTuning(fresh=1.0, rays=64)).render(cameras).images
@@ -283,7 +283,7 @@ def test_steps_from_nothing_but_fresh_weights_are_those_from_random_ones():
     none = adapter.fine_tune(support, 3, FineTuning(fresh=0.0, rays=64)).render(cameras).images
     assert not torch.allclose(fresh, none, atol=1e-3)
     plain = adapter.fine_tune(support, 3, FineTuning(rays=64))
-    assert torch.equal(none, plain.render(cameras).images)  # with few views, as before
+    assert torch.equal(none, plain.render(cameras).images)  # the default for few views
     assert FineTuning().fresh_share(MANY_VIEWS) == FRESH
     with pytest.raises(ValueError, match="fresh: expected a share"):
         FineTuning(fresh=1.5)
@@ -298,7 +298,7 @@ def test_what_a_hypernetwork_cannot_write_is_refused(changed, expected):
         HyperPlanes(replace(config, network=replace(config.network, **changed)))
 
 
-def test_no_step_is_the_field_of_one_step_whatever_the_share_of_fresh_weights():
+def test_zero_steps_give_the_adapted_field_for_any_fresh_share():
     adapter, support = model(**READERS["volume"]), views(6)
     cameras, done = ring(2, (10, 13), shift=1), []
     tuned = adapter.fine_tune(support, 0, FineTuning(fresh=0.7), on_step=done.append)
@@ -320,7 +320,7 @@ def test_a_model_in_half_precision_is_refused_in_one_line():
 
 
 @pytest.mark.parametrize("free", ["weights", "hypernetwork"])
-def test_the_weights_of_one_object_make_its_field_and_its_surface_again(free):
+def test_weights_of_one_object_reproduce_its_field_and_its_surface(free):
     adapter, support = model(**READERS["volume"]), views(6)
     with torch.no_grad():
         adapter.targets["fine"].density.bias.sub_(HAZE - 1)
@@ -329,4 +329,4 @@ def test_the_weights_of_one_object_make_its_field_and_its_surface_again(free):
     again = adapter.with_weights_of(tuned).adapt(support).render(cameras).images
     torch.testing.assert_close(again, tuned.render(cameras).images, atol=1e-6, rtol=0)
     before = adapter.adapt(support).field.planes
-    assert not torch.equal(before._surface, tuned.field.planes._surface)  # that of the tuned weights
+    assert not torch.equal(before._surface, tuned.field.planes._surface)  # the surface is that of the tuned weights

@@ -1,4 +1,4 @@
-"""Source of truth: means of the pictures of the field after gradient steps and of the one that they begin with."""
+"""Source of truth: means of the pictures after gradient steps and of those before them, computed here."""
 
 from dataclasses import replace
 
@@ -45,14 +45,14 @@ def test_steps_on_few_views_begin_after_the_learned_ones():
     adapter, still = stepping(), replace(FEW, learning_rate=0.0, muon_learning_rate=0.0)
     for count in (3, MANY_VIEWS):
         support = ball_views(ring(count))
-        made = made_anyway(lambda given=support: adapter.fine_tune(given, 1, still))  # which lowers nothing
+        made = made_anyway(lambda given=support: adapter.fine_tune(given, 1, still))  # rates of 0 lower no error
         one_step = adapter.adapt(support)
         assert torch.equal(made.field.parameters["grid.weight"], one_step.field.parameters["grid.weight"]) == (
             count == 3
         )
 
 
-def test_who_has_no_field_before_the_steps_is_shown_as_they_end():
+def test_pictures_are_not_averaged_without_a_field_before_the_steps():
     adapter, support = stepping(), ball_views(ring(4))
     assert isinstance(adapter.fine_tune(support, 1, FEW), AveragedField)
     assert not isinstance(adapter.fine_tune(ball_views(ring(MANY_VIEWS)), 1, FEW), AveragedField)
@@ -76,7 +76,7 @@ def test_reflections_are_not_counted_where_an_average_is_given():
 
 
 @pytest.mark.parametrize("cells", [None, 40])
-def test_the_weights_of_one_object_keep_both_and_further_steps_the_first(cells, tmp_path):
+def test_saved_weights_of_one_object_contain_both_fields_of_the_average(cells, tmp_path):
     adapter, support = stepping(), ball_views(ring(3))
     tuned = adapter.fine_tune(support, 2, replace(FEW, cells=cells))
     adapter.with_weights_of(tuned).save(tmp_path)
@@ -89,7 +89,7 @@ def test_the_weights_of_one_object_keep_both_and_further_steps_the_first(cells, 
     assert further.share == 0.5
 
 
-def test_how_many_steps_are_best_is_found_by_means(monkeypatch):
+def test_the_best_number_of_steps_is_found_with_averaged_pictures(monkeypatch):
     monkeypatch.setattr(descent, "HOLDOUT_RAYS", 256)
     adapter, support = stepping(), ball_views(ring(9))
     shown, holdout = split_holdout(support, FEW)
@@ -102,4 +102,4 @@ def test_how_many_steps_are_best_is_found_by_means(monkeypatch):
         )
         for share in (0.0, 1.0)
     ]
-    assert stops[0] > stops[1] == 0  # every mean is the same picture
+    assert stops[0] > stops[1] == 0  # with a share of 1, all numbers of steps give the same pictures

@@ -1,6 +1,6 @@
-"""An object without masks is told from the room behind it.
+"""Tests of separating an object from its background without masks.
 
-Source of truth: a ball in front of walls, both drawn here in closed form, and the outline of the ball.
+Source of truth: a ball in front of walls, both rendered here in closed form, and the outline of the ball.
 """
 
 import json
@@ -26,7 +26,7 @@ SIDE, RADIUS, WALLS = 32, 0.6, 4.0
 
 @pytest.fixture(scope="module")
 def scene():
-    """Views of an orange ball among walls of bluish stripes, and the ball's outlines."""
+    """Views of an orange ball between walls with bluish stripes, and the outlines of the ball."""
     eyes = 2.5 * camera.fibonacci_sphere(14, 1.0)[:, 2, :3]
     lens = camera.symmetric_intrinsics(SIDE, SIDE, 0.9)
     cameras = camera.pinhole(lens, camera.look_at(eyes), SIDE, SIDE)
@@ -57,14 +57,14 @@ def overlap(views, outlines):
     return float((found & outlines).sum() / (found | outlines).sum())
 
 
-def test_the_object_is_cut_out_of_views_that_were_fitted_and_of_others(scene, capsys, monkeypatch, tmp_path):
+def test_the_object_is_cut_out_of_support_and_query_views(scene, capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path))
     monkeypatch.setattr(background, "LEVELS", ((SIDE, 16, 16, 120),))
     views, outlines = scene
     task = Task(views[:11], views[11:], "ball")
     found = cut_out_task(task, Console())
     assert "background: learned; the object covers " in capsys.readouterr().out
-    assert overlap(found.support, outlines[:11]) > 0.75  # 0.36 of the whole sphere's outline
+    assert overlap(found.support, outlines[:11]) > 0.75  # the outline of the whole sphere has 0.36
     assert overlap(found.query, outlines[11:]) > 0.75
     corner = found.query.images[..., 0, 0]
     torch.testing.assert_close(corner, torch.ones_like(corner), atol=0.02, rtol=0)
@@ -75,7 +75,7 @@ def test_the_object_is_cut_out_of_views_that_were_fitted_and_of_others(scene, ca
 
 
 def test_view_shows_the_object_alone(scene, monkeypatch, tmp_path):
-    """What the page shows, and the model adapts to, is the ball, over white; viser and the model have no part in it."""
+    """The page and the model get the ball over white. The viewer and the model are replaced by mocks."""
     monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path / "cache"))
     views, outlines = scene
     poses = torch.linalg.inv(camera.camera_from_world(views.cameras).double()).numpy()
@@ -103,12 +103,12 @@ def test_view_shows_the_object_alone(scene, monkeypatch, tmp_path):
     assert view.run(view.Arguments(tmp_path, learn_background=True)) == 0
     assert len(shown) == 2
     for support in shown:
-        assert overlap(support, outlines) > 0.75  # 0.36 of the whole sphere's outline
+        assert overlap(support, outlines) > 0.75  # the outline of the whole sphere has 0.36
         corner = support.images[..., 0, 0]
         torch.testing.assert_close(corner, torch.ones_like(corner), atol=0.02, rtol=0)
 
 
-def test_without_the_outer_grid_the_sphere_holds_the_background(scene, monkeypatch):
+def test_without_the_outer_grid_the_background_is_in_the_sphere(scene, monkeypatch):
     views, outlines = scene
     read = background._read
 
@@ -125,7 +125,7 @@ def test_too_few_views_are_refused(scene):
         separate_background(scene[0][:4])
 
 
-def test_what_has_masks_stays_as_it_is(scene):
+def test_views_with_masks_are_not_changed(scene):
     views, outlines = scene
     given = Views(views.images, views.cameras, outlines.float())
     assert cut_out_task(Task(given, given), Console()).support is given

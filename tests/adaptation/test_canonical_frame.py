@@ -1,4 +1,4 @@
-"""Source of truth: pictures of a rotated scene are those of the scene, and the rotation that was asked for."""
+"""Source of truth: pictures of a rotated scene, which must be those of the scene, and known rotations."""
 
 import json
 import math
@@ -36,7 +36,7 @@ BESIDE = Sphere((0.2, -0.1, 0.1), 1.1)
 
 
 def made(**changes):
-    """The field of an object, with density where its hull is."""
+    """The field of an object, with a high density in its hull."""
     adapter = model(**changes)
     with torch.no_grad():
         adapter.theta["fine.density.bias"].fill_(1.0)
@@ -44,7 +44,7 @@ def made(**changes):
 
 
 @pytest.mark.parametrize("hull_share", [0.0, 0.3, 0.9])
-def test_the_field_of_a_rotated_object_is_seen_by_rotated_cameras_as_the_other_one_was(hull_share):
+def test_a_rotated_field_looks_the_same_to_rotated_cameras(hull_share):
     field, rotation = made(stacked=False, hull_share=hull_share), Rotation(ANGLE)
     rotated = rotation.field(field)
     assert isinstance(rotated, RotatedField)
@@ -62,7 +62,7 @@ def test_the_field_of_a_rotated_object_is_seen_by_rotated_cameras_as_the_other_o
     assert float(psnr(again.images, expected.images).min()) > 40
 
 
-def test_densities_colours_and_rays_of_a_rotated_field_are_those_at_rotated_places():
+def test_densities_colours_and_rays_of_a_rotated_field_agree_at_rotated_points():
     field, rotation = made(stacked=False), Rotation(ANGLE)
     rotated, motion = rotation.field(field), rotation.about(BESIDE).float()
     points = BESIDE.radius * (torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5)
@@ -73,7 +73,7 @@ def test_densities_colours_and_rays_of_a_rotated_field_are_those_at_rotated_plac
         hidden = rotated.field.hidden(moved)
         torch.testing.assert_close(rotated.field.density_of(hidden), density, atol=1e-3, rtol=1e-3)
         torch.testing.assert_close(rotated.field.colour_of(hidden, turned), colour, atol=1e-4, rtol=1e-3)
-        # a few points lie at a border of what the views see, which rounding moves
+        # rounding changes the visibility of a few points
         expected = field(points, along)
         assert ((colour - expected[0]).abs().amax(1) < 1e-3).float().mean() > 0.98
         assert ((density - expected[1]).abs() < 1e-2 * (1 + expected[1])).float().mean() > 0.98
@@ -83,14 +83,14 @@ def test_densities_colours_and_rays_of_a_rotated_field_are_those_at_rotated_plac
         truth = field.trace(views.rays(0), differentiable=False).colour
         assert ((seen - truth).abs().amax(1) < 1e-3).float().mean() > 0.98
     assert (rotated.dtype, rotated.thread_safe) == (field.dtype, field.thread_safe)
-    # the voxels hold all that those of the other field hold, and not much more
+    # the voxels contain those of the other field, and not many more
     inside = field.occupancy.contains(points)
     assert inside.any()
     assert rotated.occupancy.contains(moved)[inside].all()
     assert rotated.occupancy.occupied.sum() < 4 * field.occupancy.occupied.sum()
 
 
-def test_voxels_of_a_rotated_field_lie_in_the_frame_of_the_scene():
+def test_voxels_of_a_rotated_field_are_in_the_frame_of_the_scene():
     field, rotation = HullBlend().adapt(balls(cameras(6), BODY, BESIDE)), Rotation(ANGLE)
     asked = ring(2, SMALL, shift=1)
     expected = BakedScene(bake(field, side=64)).render(asked).images
@@ -109,11 +109,11 @@ def test_a_rotated_symmetry_is_that_of_the_rotated_views():
     assert rotation.inverse.symmetry(found, BESIDE).plane.offset == pytest.approx(symmetry.plane.offset)
     several = Symmetry(Plane.of_sphere(BESIDE, (1.0, 0.0, 0.0)), 3, BESIDE.centre)
     moved = Rotation(ANGLE).symmetry(several, Sphere((1.0, 0.0, 2.0)))
-    assert moved.order == 3  # whose plane goes through its axis, or it would have been refused
+    assert moved.order == 3  # the plane contains the axis, or it would be refused
 
 
 def found_by(monkeypatch, qualities, symmetry=ACROSS, count=4, **changes):
-    """The rotation in degrees where held-out views have these PSNR after each, in the order they are tried."""
+    """The rotation in degrees that is found if held-out views have these PSNR for the rotations, in order of trial."""
     tried = []
 
     def quality(network, placed, held_out):
@@ -131,7 +131,7 @@ def found_by(monkeypatch, qualities, symmetry=ACROSS, count=4, **changes):
 
 
 def turned(angle):
-    """The symmetry of an object that is rotated so from one about x = 0."""
+    """The symmetry about x = 0, rotated by an angle."""
     return Symmetry(Plane((math.cos(angle), 0.0, -math.sin(angle))))
 
 
@@ -142,25 +142,25 @@ def threads():
     torch.set_num_threads(before)
 
 
-def test_held_out_views_choose_among_the_rotations_that_bring_the_plane_across_an_axis(monkeypatch):
+def test_held_out_views_choose_a_rotation_that_aligns_the_plane_with_an_axis(monkeypatch):
     assert found_by(monkeypatch, [21.0, 22.0, 24.0, 23.0]) == pytest.approx(180)
     assert found_by(monkeypatch, [21.0, 23.0, 22.0, 24.0], turned(0.5)) == pytest.approx(270 - math.degrees(0.5))
     assert found_by(monkeypatch, [21.0, 21.0, 21.0, 21.0], turned(1.2)) == pytest.approx(90 - math.degrees(1.2))
-    # by a little less than is asked for, an object whose plane is across an axis stays as it faces, and no other one
+    # below the required gain, an object whose plane is aligned already is not rotated; any other one is
     less, more = 21 + GAIN - 0.01, 21 + GAIN + 0.01
     assert found_by(monkeypatch, [21.0, less, 21.0, 21.0]) == 0
     assert found_by(monkeypatch, [21.0, more, 21.0, 21.0]) == pytest.approx(90)
     assert found_by(monkeypatch, [21.0, less, 21.0, 21.0], turned(0.5)) == pytest.approx(90 - math.degrees(0.5))
 
 
-def test_each_held_out_view_counts_by_its_own_psnr(monkeypatch):
-    """By the sum of squared errors the second view alone would decide, which no rotation shows well."""
+def test_psnr_is_averaged_over_held_out_views(monkeypatch):
+    """With the sum of squared errors, the second view alone would decide, which no rotation renders well."""
     one, other = (30.0, 10.0), (26.0, 10.5)
     assert found_by(monkeypatch, [one, other, 10.0, 10.0], turned(0.5)) == pytest.approx(-math.degrees(0.5))
     assert found_by(monkeypatch, [other, one, 10.0, 10.0], turned(0.5)) == pytest.approx(90 - math.degrees(0.5))
 
 
-def test_what_shows_no_frame_is_left_as_it_faces(monkeypatch):
+def test_objects_without_a_suitable_symmetry_or_number_of_views_are_not_rotated(monkeypatch):
     better = [21.0, 24.0, 22.0, 22.0]
     assert found_by(monkeypatch, better) == pytest.approx(90)
     assert found_by(monkeypatch, better, None) == 0
@@ -172,7 +172,7 @@ def test_what_shows_no_frame_is_left_as_it_faces(monkeypatch):
     assert found_by(monkeypatch, better, None, azimuth=1.0) == pytest.approx(math.degrees(1.0))
 
 
-def test_a_quality_is_that_of_a_view_that_is_not_shown(monkeypatch):
+def test_the_quality_of_a_frame_is_that_of_a_held_out_view(monkeypatch):
     adapter, views = model(), balls(cameras(4, SMALL), BODY)
     shown = []
     prepare = adapter.prepare
@@ -186,8 +186,8 @@ def test_a_quality_is_that_of_a_view_that_is_not_shown(monkeypatch):
 
 
 @pytest.mark.parametrize("steps", [0, 2])
-def test_a_field_in_its_frame_is_kept_with_it_and_is_in_the_frame_of_the_scene(steps):
-    """A rotation that is known shows the same pictures as one of the scene before everything."""
+def test_a_field_is_saved_with_its_frame_and_rendered_in_that_of_the_scene(steps):
+    """A known rotation gives the same pictures as rotating the scene first."""
     views, rotation = balls(cameras(4, SMALL), BODY), Rotation(ANGLE)
     adapter = model(azimuth=ANGLE, symmetry=ACROSS)
     with torch.no_grad():
@@ -220,14 +220,14 @@ def test_a_placed_object_is_rotated_with_its_symmetry():
     assert unrotated.in_scene(field := made(stacked=False)) is field
 
 
-def test_another_objects_update_is_shown_in_the_frame_of_the_scene():
+def test_a_field_with_a_swapped_update_is_in_the_frame_of_the_scene():
     views, other = balls(cameras(4, SMALL), BODY), balls(cameras(4, SMALL), BODY[:2])
     found = Swapped(model(azimuth=ANGLE, symmetry=ACROSS), [views, other]).adapt(views)
     assert isinstance(found, RotatedField)
     assert found.rotation == Rotation(-ANGLE)
 
 
-def test_a_field_that_knows_its_views_by_their_places_has_no_azimuth():
+def test_a_field_with_fixed_planes_refuses_an_azimuth():
     with pytest.raises(ValueError, match="azimuth: expected a field that takes any number of views"):
         HyperPlanes(ModelConfig(azimuth=ANGLE))
 
@@ -241,7 +241,7 @@ def test_views_that_auto_holds_out_are_rotated_with_the_others(monkeypatch):
 
 
 @pytest.mark.parametrize("angle", [0.0, ANGLE])
-def test_steps_that_lower_nothing_leave_a_field_in_the_frame_of_the_scene(angle, monkeypatch):
+def test_the_field_of_unsuccessful_steps_is_in_the_frame_of_the_scene(angle, monkeypatch):
     views, settings = balls(cameras(4, SMALL), BODY), FineTuning(rays=16)
     adapter = model(azimuth=angle, symmetry=ACROSS)
     expected = made_anyway(lambda: adapter.fine_tune(views, 1, settings))
@@ -254,7 +254,7 @@ def test_steps_that_lower_nothing_leave_a_field_in_the_frame_of_the_scene(angle,
 
 
 @pytest.mark.parametrize("angle", [0.0, ANGLE])
-def test_a_protocol_is_that_of_a_rotated_field_too(angle):
+def test_a_protocol_applies_to_a_rotated_field(angle):
     views, sampler = balls(cameras(4, SMALL), BODY), Hierarchical(2, 2)
     adapter = model(azimuth=angle, symmetry=ACROSS, stacked=False)
     found = WithSampler(adapter, sampler).adapt(views).render(views.cameras)
@@ -262,8 +262,8 @@ def test_a_protocol_is_that_of_a_rotated_field_too(angle):
     assert found.samples == len(views) * height * width * (2 + 4)
 
 
-def test_a_model_in_training_stays_in_training_and_learns_nothing_of_the_frame(monkeypatch):
-    """Two threads at once, of which the first to end must not switch the other one back."""
+def test_finding_a_rotation_leaves_the_mode_and_the_weights_of_a_model(monkeypatch):
+    """With two threads: the first one to end must not switch the model back to training mode for the other."""
     monkeypatch.setattr(canonical_frame, "PIXELS", 64)
     views = replace(balls(cameras(2, SMALL), BODY), masks=None)  # without a hull
     adapter, before = HyperPlanes(replace(CONFIG, symmetric=True)).train(), torch.get_num_threads()
@@ -279,21 +279,21 @@ def test_a_model_in_training_stays_in_training_and_learns_nothing_of_the_frame(m
 
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf])
-def test_an_angle_that_is_none_is_refused(angle):
+def test_an_angle_that_is_not_finite_is_refused(angle):
     with pytest.raises(ValueError, match="azimuth: expected a finite angle in radians"):
         model(azimuth=angle)
 
 
-def test_a_command_says_that_an_object_was_rotated(monkeypatch, tmp_path, capsys):
+def test_a_command_prints_that_an_object_was_rotated(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path))
     for angle, said in ((ANGLE, True), (0.0, False)):
         adapt_to(model(azimuth=angle, symmetry=ACROSS), balls(cameras(4, SMALL), BODY), "balls", Console())
         assert ("rotated into its canonical frame" in "".join(capsys.readouterr())) == said
 
 
-def test_a_field_that_is_one_function_stays_one():
+def test_a_field_that_is_a_plain_function_stays_one():
     field = AdaptedField(lambda points, directions: (points, points[:, 0]), full(BESIDE, 4), RayMarching(4))
     rotated, points = Rotation(math.pi / 2).field(field), torch.tensor([[0.2, 0.3, 0.5]])
     assert not isinstance(rotated.field, SplitField)
-    # by a quarter turn about (0.2, y, 0.1) z is mapped onto x: from x = 0.6
+    # a quarter turn about (0.2, y, 0.1) maps z to x, so that the point comes from x = 0.6
     torch.testing.assert_close(rotated(points, points)[0], torch.tensor([[-0.2, 0.3, 0.1]]))

@@ -1,5 +1,5 @@
-"""Sources of truth: properties of descent (what is frozen stays to the bit, no step is adapting, the seed decides), and
-a loss that falls on the support views.
+"""Sources of truth: properties of gradient descent (frozen weights do not change by a bit, zero steps are adapting, the
+seed determines the result), and a loss that decreases on the support views.
 """
 
 import threading
@@ -44,17 +44,17 @@ def support():
 
 @pytest.fixture
 def few_held_out_rays(monkeypatch):
-    """Held-out views are judged by fewer rays than users have."""
+    """Evaluate held-out views with fewer rays than by default."""
     monkeypatch.setattr(descent_module, "HOLDOUT_RAYS", 256)
 
 
 def moved(model, field):
-    """Names of the parameters that differ from theta."""
+    """The names of the parameters that differ from theta."""
     theta = model.theta.under("fine")
     return {name for name, value in field.parameters.items() if not torch.equal(value, theta[name])}
 
 
-def test_an_empty_picture_is_judged_by_the_distance_of_the_views_from_white(model):
+def test_the_error_of_an_empty_picture_is_that_of_white(model):
     grey = ball_views(ring(4))
     grey = replace(grey, images=torch.full_like(grey.images, 0.25))
     descent = make_descent(model, model.prepare(grey), WEIGHTS)
@@ -87,7 +87,7 @@ def test_the_weighted_mean_of_drawn_pixels_is_that_of_all(some):
         draw_pixels(importance, torch.arange(0), 1, generator)
 
 
-def test_a_loss_counts_each_ray_by_its_weight():
+def test_the_loss_weights_each_ray():
     seen = Rendered(*(torch.zeros(2, *shape) for shape in ((3,), (), ())), samples=0)
     truth = torch.tensor([[1.0, 1.0, 1.0], [2.0, 2.0, 2.0]])
     assert float(ray_loss(seen, truth)) == 2.5
@@ -106,7 +106,7 @@ def test_a_loss_counts_each_ray_by_its_weight():
         ("point_multiplane", "weights", FINE_VIEWS, "uniform", 0),
     ],
 )
-def test_many_views_decide_how_the_weights_of_a_field_of_any_number_are_tuned(target, trainable, count, draw, cells):
+def test_the_number_of_views_determines_the_draw_and_the_cells(target, trainable, count, draw, cells):
     many = ball_views(ring(count))
     if target == "image_based":
         network = ImageBasedConfig(depth=2, width=16, grid=2)
@@ -124,7 +124,7 @@ def test_many_views_decide_how_the_weights_of_a_field_of_any_number_are_tuned(ta
 
 
 @pytest.mark.parametrize(("cells", "optimised"), [(None, 64), (0, 32), (16, 32), (48, 48)])
-def test_steps_optimise_a_grid_of_more_cells_which_is_kept_with_the_field(cells, optimised, tmp_path):
+def test_steps_optimise_a_finer_grid_which_is_saved_with_the_field(cells, optimised, tmp_path):
     network = ImageBasedConfig(depth=2, width=16, grid=2)
     model = small_model(target="image_based", network=network, hypernetwork=VolumeHyperNetworkConfig())
     views = ball_views(ring(FINE_VIEWS, (12, 12)))
@@ -139,8 +139,8 @@ def test_steps_optimise_a_grid_of_more_cells_which_is_kept_with_the_field(cells,
     assert further.field.parameters["grid.weight"].shape[-1] == 64
 
 
-def test_a_field_stays_as_it_is_when_its_model_is_trained_on():
-    """Also by weights that no hypernetwork writes."""
+def test_a_field_does_not_change_when_its_model_is_trained():
+    """With and without a hypernetwork."""
     views = ball_views(ring(4, (12, 12)))
     for changes in ({}, {"hypernetwork": None}):
         model = small_model(**changes)
@@ -157,7 +157,7 @@ def test_weights_of_double_precision_are_kept_as_they_are():
     model = small_model(hypernetwork=None).double()
     with torch.no_grad():
         for value in model.parameters():
-            value.mul_(1 + 1e-10)  # which single precision does not hold
+            value.mul_(1 + 1e-10)  # not representable in single precision
     views = ball_views(ring(4, (12, 12)))
     again = model.with_weights_of(model.adapt(views))
     assert all(torch.equal(value, again.theta[name]) for name, value in model.theta.items())
@@ -178,8 +178,8 @@ def test_weights_that_are_given_and_hypernetworks_keep_their_cells():
         other.with_weights_of(model.adapt(views))
 
 
-def test_a_grid_of_more_cells_is_the_same_field_where_it_is_even():
-    """Features that grow evenly along an axis are the same when they are interpolated."""
+def test_a_finer_grid_has_the_same_linear_features():
+    """Closed form: interpolation does not change features that are linear along an axis."""
     network = ImageBasedNeRF(ImageBasedConfig(depth=2, width=16, planes=2, grid=3))
     places = (torch.arange(32.0) + 0.5) / 16 - 1
     ramps = torch.stack(torch.meshgrid(places, places, places, indexing="ij"))
@@ -193,7 +193,7 @@ def test_a_grid_of_more_cells_is_the_same_field_where_it_is_even():
     assert network.finer(weights, 16) is weights
 
 
-def test_the_draw_of_pixels_decides(model, support):
+def test_the_draw_of_pixels_changes_the_result(model, support):
     tuned = [
         model.fine_tune(support, 2, replace(WEIGHTS, draw=draw)).render(ring(1)).images
         for draw in (None, "uniform", "contrast")
@@ -205,7 +205,7 @@ def test_the_draw_of_pixels_decides(model, support):
 
 
 @pytest.mark.parametrize("settings", [PAPER, WEIGHTS])
-def test_the_model_stays_as_it_is_bit_for_bit(model, support, settings):
+def test_the_model_does_not_change_by_a_bit(model, support, settings):
     before = {name: value.clone() for name, value in model.state_dict().items()}
     model.fine_tune(support, 3, settings)
     after = model.state_dict()
@@ -214,7 +214,7 @@ def test_the_model_stays_as_it_is_bit_for_bit(model, support, settings):
     assert all(value.grad is None for value in model.parameters())
 
 
-def test_theta_is_frozen_and_only_the_updated_layers_move_in_the_papers_way(model, support):
+def test_fine_tuning_the_hypernetwork_changes_only_the_updated_layers(model, support):
     fields = [model.fine_tune(support, steps, PAPER).field for steps in (0, 4)]
     for name, value in model.theta.under("fine").items():
         first, last = fields[0].parameters[name], fields[1].parameters[name]
@@ -226,14 +226,14 @@ def test_theta_is_frozen_and_only_the_updated_layers_move_in_the_papers_way(mode
         assert not last.requires_grad
 
 
-def test_all_weights_move_when_they_are_free(model, support):
+def test_fine_tuning_the_weights_changes_all_of_them(model, support):
     field = model.fine_tune(support, 3, WEIGHTS).field
     assert moved(model, field) == set(model.theta.under("fine"))
     assert not any(value.requires_grad for value in field.parameters.values())
 
 
 @pytest.mark.parametrize("settings", [PAPER, WEIGHTS])
-def test_no_steps_are_adapting(model, support, settings):
+def test_zero_steps_are_adapting(model, support, settings):
     cameras = ring(1, shift=1)
     tuned = model.fine_tune(support, 0, settings).render(cameras).images
     assert torch.equal(tuned, model.adapt(support).render(cameras).images)
@@ -258,14 +258,14 @@ def test_the_seed_decides(model, support):
     assert torch.equal(before, torch.random.get_rng_state())
 
 
-def test_it_works_where_gradients_are_switched_off(model, support):
+def test_fine_tuning_works_inside_no_grad(model, support):
     with torch.no_grad():
         tuned = model.fine_tune(support, 2, WEIGHTS)
     assert not torch.equal(tuned.render(ring(1)).images, model.adapt(support).render(ring(1)).images)
 
 
-def test_the_coarse_network_is_fine_tuned_beside_the_fine_one(support):
-    # the outputs of this hypernetwork are zero: only a loss of the coarse picture can move the coarse weights
+def test_the_coarse_network_is_fine_tuned_too(support):
+    # the hypernetwork outputs zero, so that only a loss of the coarse picture can change the coarse weights
     both = small_model(coarse_network=True, sampling=Hierarchical(6, 6))
     tuned = both.fine_tune(support, 1, PAPER)
     for part, field in (("fine", tuned.field), ("coarse", tuned.proposal)):
@@ -289,7 +289,7 @@ def test_wrong_settings_are_refused(model, support):
 
 
 @pytest.mark.usefixtures("few_held_out_rays")
-def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, support):
+def test_auto_takes_no_step_if_all_steps_make_held_out_views_worse(model, support):
     taken, tried = [], []
     ruinous = replace(WEIGHTS, learning_rate=1e30, muon_learning_rate=1e30, max_steps=12)  # NaN after the first step
     field = model.fine_tune(support, "auto", ruinous, on_step=taken.append, on_trial=tried.append)
@@ -300,7 +300,7 @@ def test_auto_takes_no_step_where_every_step_makes_left_out_views_worse(model, s
 
 
 @pytest.mark.usefixtures("few_held_out_rays")
-def test_auto_goes_on_where_steps_show_left_out_views_better():
+def test_auto_continues_while_held_out_views_get_better():
     model, support, taken, tried = awaken(small_model()), ball_views(ring(9)), [], []
     field = model.fine_tune(
         support, "auto", replace(WEIGHTS, max_steps=40, holdout=3), on_step=taken.append, on_trial=tried.append
@@ -313,7 +313,7 @@ def test_auto_goes_on_where_steps_show_left_out_views_better():
     assert quality[1] > quality[0] + 3
 
 
-def test_left_out_views_are_neither_planes_nor_rays_while_the_number_of_steps_is_chosen(model, monkeypatch):
+def test_held_out_views_give_neither_planes_nor_rays_while_steps_are_chosen(model, monkeypatch):
     support, prepared, drawn = ball_views(ring(9)), [], []
     prepare, sample = HyperPlanes.prepare, type(support).sample_rays
     monkeypatch.setattr(
@@ -327,18 +327,18 @@ def test_left_out_views_are_neither_planes_nor_rays_while_the_number_of_steps_is
     monkeypatch.setattr(type(support), "sample_rays", sampled)
     model.fine_tune(support, "auto", replace(WEIGHTS, max_steps=2, holdout=3))
     assert [len(views) for views in prepared] == [6, 9]
-    assert drawn[0] == (3, 4096)  # the rays that judge
+    assert drawn[0] == (3, 4096)  # the rays of the held-out views
     assert {count for views, count in drawn[1:]} == {64}
     assert {views for views, _ in drawn[1:]} <= {6, 9}
 
 
-def test_as_a_method_it_takes_its_steps_on_every_object(model, support):
+def test_the_method_fine_tunes_on_the_object(model, support):
     cameras = ring(1, shift=1)
     tuned = FineTuned(model, 2, WEIGHTS).adapt(support).render(cameras).images
     assert torch.equal(tuned, model.fine_tune(support, 2, WEIGHTS).render(cameras).images)
 
 
-def test_from_scratch_nothing_that_was_trained_is_used(support):
+def test_from_scratch_uses_no_trained_weights(support):
     cameras = ring(1, shift=1)
     pictures = []
     for seed in (0, 1):
@@ -365,13 +365,13 @@ def test_from_scratch_nothing_that_was_trained_is_used(support):
         ({"cells": 300}, "cells: expected"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(settings, message):
+def test_settings_out_of_range_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         FineTuning(**settings)
 
 
 @pytest.mark.usefixtures("few_held_out_rays")
-def test_auto_tries_what_it_goes_on_with(monkeypatch):
+def test_auto_uses_the_same_settings_in_both_passes(monkeypatch):
     decided, made = [], fine_tuning.make_descent
 
     def noting(*given):
@@ -389,7 +389,7 @@ def test_auto_tries_what_it_goes_on_with(monkeypatch):
 
 
 @pytest.mark.usefixtures("few_held_out_rays")
-def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
+def test_the_best_number_of_steps_is_compared_with_a_given_field():
     model, support = awaken(small_model()), ball_views(ring(9))
     shown, holdout = split_holdout(support, WEIGHTS)
     context = model.prepare(shown)
@@ -403,11 +403,11 @@ def test_the_field_of_no_step_may_be_another_one_than_steps_begin_with():
     assert stops[0] > stops[1] == 0
 
 
-def test_parts_of_the_rays_of_a_step_have_the_gradients_of_all_whatever_the_threads(model, support, monkeypatch):
+def test_gradients_of_parts_of_the_rays_sum_to_those_of_all_for_any_number_of_threads(model, support, monkeypatch):
     monkeypatch.setattr(descent_module, "PART", 12)
     descent = make_descent(model, model.prepare(support), WEIGHTS)
     field, (rays, truth) = descent.field(None), support.sample_rays(30, generator=torch.Generator().manual_seed(1))
-    # one loss of the same rays, each part of which takes its samples from a generator of its own
+    # one loss of the same rays; the samples of each part come from its own generator
     seeds = torch.randint(2**62, (3,), generator=torch.Generator().manual_seed(2)).tolist()
     parts = [(slice(12 * place, 12 * place + 12), seed) for place, seed in enumerate(seeds)]
     seen = [field.trace(rays[part], torch.Generator().manual_seed(seed)).colour for part, seed in parts]

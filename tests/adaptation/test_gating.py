@@ -1,4 +1,4 @@
-"""Source of truth: shares that are set by hand, means of pictures, and which picture is right by construction."""
+"""Sources of truth: shares set by hand, means of pictures, and examples in which it is known which picture is right."""
 
 import queue
 from dataclasses import replace
@@ -33,8 +33,8 @@ def constant(share):
     return gate
 
 
-@pytest.mark.parametrize("by_object", [0.1, 0.95])  # of which the second makes the hull the field that has densities
-def test_a_gate_that_gives_all_pixels_one_share_is_a_mean_by_that_share(by_object):
+@pytest.mark.parametrize("by_object", [0.1, 0.95])  # with the second, densities are those of the hull
+def test_a_gate_with_a_constant_share_gives_the_mean_with_that_share(by_object):
     learned, hull = both(ball_views(ring(6, (24, 24))))
     stacked, cameras = stack(learned, hull, by_object, constant(0.3), 6), ring(2, (10, 13), shift=1)
     one, other, mixed = (each.render(cameras) for each in (learned, hull, stacked))
@@ -46,7 +46,7 @@ def test_a_gate_that_gives_all_pixels_one_share_is_a_mean_by_that_share(by_objec
     torch.testing.assert_close(mixed.opacity, torch.lerp(one.opacity, other.opacity, 0.3))
 
 
-def test_shares_of_pictures_are_those_of_their_pixels():
+def test_shares_are_computed_per_pixel():
     learned, hull = both(ball_views(ring(6, (24, 24))))
     cameras, gate = ring(2, (10, 13), shift=1), GatingNetwork()
     one, other = (each.render(cameras) for each in (learned, hull))
@@ -68,7 +68,7 @@ def test_a_gate_in_double_precision_gives_the_same_shares():
     torch.testing.assert_close(gate.double().shares(*pictures, 0.4, 6), expected)
 
 
-def test_pixels_are_gated_from_five_views_with_masks_on():
+def test_pixels_are_gated_with_five_or_more_masked_views():
     adapter = HyperPlanes(replace(CONFIG, gated=True))
     for count in (FEWEST - 1, FEWEST):
         support = ball_views(ring(count, (24, 24)))
@@ -76,8 +76,8 @@ def test_pixels_are_gated_from_five_views_with_masks_on():
         assert not isinstance(adapter.adapt(replace(support, masks=None)), StackedField)
 
 
-def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
-    """By what the gate gives where held-out views give no share of the hull."""
+def test_fine_tuned_pictures_are_gated_with_ten_or_more_masked_views():
+    """The share of the object, an input of the gate, is 0 for fine-tuned fields."""
     adapter, settings = HyperPlanes(replace(CONFIG, gated=True)), FineTuning(rays=8)
     cameras = ring(2, (10, 13), shift=1)
     adapter.gate.load_state_dict(constant(0.3).state_dict())
@@ -93,7 +93,7 @@ def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
     torch.testing.assert_close(again.render(cameras).images, tuned.render(cameras).images, atol=1e-6, rtol=0)
     adapter.config = replace(adapter.config, residuals=True)
     corrected = adapter.fine_tune(support, 1, settings)
-    assert not isinstance(corrected.without_residuals(), StackedField)  # pictures that are corrected need no hull
+    assert not isinstance(corrected.without_residuals(), StackedField)  # corrected pictures are not stacked
     assert not adapter.with_weights_of(corrected).config.gated
     assert isinstance(adapter.without_residuals().fine_tune(support, 1, settings), StackedField)
     few = adapter.prepare(ball_views(ring(MANY_VIEWS - 1, (24, 24))), symmetry=Symmetry(Plane((1.0, 0.0, 0.0))))
@@ -105,7 +105,7 @@ def test_fine_tuned_pictures_are_gated_from_ten_views_with_masks_on():
 
 
 @pytest.mark.parametrize(("steps", "count"), [(0, MANY_VIEWS), (1, MANY_VIEWS), (1, 3)])
-def test_view_shows_the_pictures_that_render_writes_without_residuals(tmp_path, steps, count):
+def test_view_shows_the_same_pictures_as_render_without_residuals(tmp_path, steps, count):
     class Viewer:
         def show(self, field, _):
             self.field = field
@@ -119,11 +119,11 @@ def test_view_shows_the_pictures_that_render_writes_without_residuals(tmp_path, 
     view._adapt(adapter, support, arguments, viewer, queue.SimpleQueue(), Console(silent=True))
     made = adapter.without_residuals().fine_tune(support, steps)
     torch.testing.assert_close(viewer.field.render(cameras).images, made.render(cameras).images)
-    assert isinstance(made, StackedField)  # with the hull, or with the field before the steps
+    assert isinstance(made, StackedField)  # stacked with the hull, or averaged with the field before the steps
     assert not isinstance(viewer.field, CorrectedField)
 
 
-def test_view_takes_rays_as_render_does_and_shows_fields_that_stay_as_they_are(tmp_path, monkeypatch):
+def test_view_fine_tunes_on_the_same_views_as_render_and_its_fields_do_not_change(tmp_path, monkeypatch):
     class Viewer:
         fields, pictures = [], []
 
@@ -146,8 +146,8 @@ def test_view_takes_rays_as_render_does_and_shows_fields_that_stay_as_they_are(t
     assert not torch.equal(*viewer.pictures[:2])
 
 
-def test_a_fitted_gate_takes_the_picture_that_is_right(monkeypatch):
-    # Two pictures of noise, of which the first is right where opacity is 1 and the second where it is below a half.
+def test_a_fitted_gate_chooses_the_right_picture(monkeypatch):
+    # Two pictures of noise: the first is right where its opacity is 1, the second where it is below a half.
     monkeypatch.setattr(gating, "EXAMPLES", 4)
     monkeypatch.setattr(gating, "PIXELS", 256)
     generator = torch.Generator().manual_seed(0)
@@ -178,7 +178,7 @@ def opacity_of(example):
     return example.read[:, 1]
 
 
-def test_an_example_holds_what_both_pictures_show():
+def test_an_example_contains_the_pixels_that_are_not_empty_in_both_pictures():
     adapter, task = model(), Task(ball_views(ring(6, (24, 24))), ball_views(ring(2, (10, 13), shift=1)), "ball")
     found = example_of(adapter, task)
     context = adapter.prepare(task.support)
@@ -190,9 +190,9 @@ def test_an_example_holds_what_both_pictures_show():
     assert found.error == pytest.approx(float((learned.images - task.query.images).square().sum()), rel=1e-4)
 
 
-def test_a_turned_object_is_the_same_object():
+def test_a_rotated_task_shows_the_same_object():
     task = Task(ball_views(ring(6, (24, 24))), ball_views(ring(2, (24, 24), shift=1)), "ball")
     moved = turned(task, torch.Generator().manual_seed(0))
     one, other = (HullBlend().adapt(each.support).render(each.query.cameras).images for each in (task, moved))
     assert not torch.equal(moved.support.cameras.extrinsics, task.support.cameras.extrinsics)
-    assert float(psnr(other, one).min()) > 25  # but for the voxels of the hull, which do not turn
+    assert float(psnr(other, one).min()) > 25  # differences come from the voxels of the hull, which are not rotated

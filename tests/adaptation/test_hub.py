@@ -1,7 +1,7 @@
-"""Models on the Hugging Face hub. Source of truth: the model itself, through a stand-in of huggingface_hub.
+"""Models on the Hugging Face hub. Source of truth: the model itself, through a fake module huggingface_hub.
 
-Tests do not reach the hub; the stand-in keeps files in a folder and has the functions that are called, with the
-package's own arguments.
+Tests do not access the hub. The fake module stores files in a folder, and its functions have the signatures of the
+real ones.
 """
 
 import importlib.machinery
@@ -54,7 +54,7 @@ def test_a_model_comes_back_from_the_hub(hub, model):
     assert all(torch.equal(value, again.state_dict()[name]) for name, value in model.state_dict().items())
 
 
-def test_a_folder_goes_before_the_hub(hub, model):
+def test_a_folder_has_precedence_over_the_hub(hub, model):
     other = HyperPlanes(model.config, seed=1)
     other.save_pretrained(Path("someone/a-model"))
     model.push_to_hub("someone/a-model")
@@ -62,14 +62,14 @@ def test_a_folder_goes_before_the_hub(hub, model):
     assert all(torch.equal(value, again.state_dict()[name]) for name, value in other.state_dict().items())
 
 
-def test_what_is_not_there_is_said_in_one_line(hub, model):
+def test_a_missing_repository_is_reported_in_one_line(hub, model):
     with pytest.raises(CheckpointError, match="found neither: 404 Client Error$"):
         HyperPlanes.from_pretrained("someone/another")
     with pytest.raises(ValueError, match="repository: expected user/model, got 'a-model'"):
         model.push_to_hub("a-model")
 
 
-def test_without_the_package_it_says_what_to_install(model, monkeypatch, tmp_path):
+def test_without_the_package_the_error_says_what_to_install(model, monkeypatch, tmp_path):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RuntimeError, match=r"pip install 'hyperplanes\[hub\]"):

@@ -23,13 +23,13 @@ SMALL = HullBlend(side=20, steps=64)
 
 
 def painted(cameras, colours):
-    """A ball of which every view shows one colour."""
+    """A ball that has one flat colour in each view."""
     views = ball_views(cameras)
     flat = torch.tensor(colours, dtype=torch.float32)[:, :, None, None]
     return Views(torch.where(views.masks > 0, flat, torch.ones(())), cameras, views.masks, views.bounds)
 
 
-def test_a_ball_of_one_colour_has_it_in_every_view():
+def test_a_ball_of_one_colour_has_this_colour_in_new_views():
     blue = (0.2, 0.6, 0.9)
     cameras = ring(1, (24, 24), shift=5)
     pictures = SMALL.adapt(painted(ring(10, (24, 24)), [blue] * 10)).render(cameras)
@@ -41,22 +41,22 @@ def test_a_ball_of_one_colour_has_it_in_every_view():
     assert (pictures.opacity[max_pool2d(truth, 7, 1, 3) == 0] == 0).all()
 
 
-def test_seen_from_a_support_camera_it_is_nearly_that_image():
+def test_the_picture_of_a_support_camera_is_nearly_its_image():
     views = ball_views(ring(8, (24, 24)), colour=(0.9, 0.5, 0.2))
     found = SMALL.adapt(views).render(views[:2].cameras).images
     assert psnr(found, views.images[:2]).mean() > 25
 
 
 def balls_at(cameras, centre, radius):
-    """Masks of a ball somewhere."""
+    """Masks of a ball at any position."""
     moved = camera_from_world(cameras).clone()
     moved[:, :3, 3] += moved[:, :3, :3] @ torch.tensor(centre)
     return ball_views(with_poses(cameras, moved), radius=radius).masks
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_a_view_from_which_a_ball_is_hidden_gives_it_no_colour(monkeypatch, compiled):
-    """Two balls in a row: the nearest view sees one of them alone, and shows red, all others blue."""
+def test_a_view_in_which_a_ball_is_occluded_does_not_colour_it(monkeypatch, compiled):
+    """Two balls in a row: the nearest view, which is red, sees only one of them; all other views are blue."""
     if not compiled:
         monkeypatch.setattr(VisibilityPlanes, "has_kernels", lambda self, points: False)
     near, far = ((0.6, 0.0, 0.0), 0.3), ((-0.5, 0.0, 0.0), 0.25)
@@ -78,12 +78,12 @@ def test_a_view_from_which_a_ball_is_hidden_gives_it_no_colour(monkeypatch, comp
     nothing = lambda self, voxels: with_surface(self, Occupancy(torch.zeros_like(voxels.occupied), voxels.bounds))  # noqa: E731
     with_surface = VisibilityPlanes.with_surface
     monkeypatch.setattr(VisibilityPlanes, "with_surface", nothing)
-    assert redness() > 0.5  # where nothing hides it
+    assert redness() > 0.5  # if nothing occludes it
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_no_seam_is_seen_where_the_border_of_a_picture_cuts_the_object(monkeypatch, compiled):
-    """A near view whose lower border cuts the ball, red, and one from farther away that shows it whole, blue."""
+def test_there_is_no_seam_where_an_image_border_cuts_the_object(monkeypatch, compiled):
+    """A near, red view whose lower border cuts the ball, and a farther, blue one that shows all of it."""
     if not compiled:
         monkeypatch.setattr(VisibilityPlanes, "has_kernels", lambda self, points: False)
     eyes = [(2.2, 0.1, 0.0), (2.9, 0.1, 0.5), (-3.0, 0.0, 0.0), (0.0, 0.2, -3.0)]
@@ -99,11 +99,11 @@ def test_no_seam_is_seen_where_the_border_of_a_picture_cuts_the_object(monkeypat
         return float(column.diff().abs().max())
 
     smooth = steepest()
-    monkeypatch.setattr(against, "CUTTING", 10.0)  # as if nothing cut it
+    monkeypatch.setattr(against, "CUTTING", 10.0)  # without the treatment of borders
     assert steepest() > 3 * smooth
 
 
-def test_where_the_world_has_its_origin_does_not_matter():
+def test_the_result_does_not_depend_on_the_origin_of_the_world():
     red, green = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
     eyes = [(3.0, 0.0, 0.0), (-3.0, 0.0, 0.0), (0.0, 0.2, 3.0), (0.0, 0.2, -3.0)]
     here = painted(concatenate([camera_at(eye, (24, 24)) for eye in eyes]), [red, green, green, green])
@@ -115,7 +115,7 @@ def test_where_the_world_has_its_origin_does_not_matter():
     torch.testing.assert_close(one, other, atol=2e-2, rtol=0)
 
 
-def test_the_order_of_the_views_does_not_matter():
+def test_the_result_does_not_depend_on_the_order_of_the_views():
     views, cameras = ball_views(ring(6)), ring(1, shift=1)
     one = SMALL.adapt(views).render(cameras).images
     other = SMALL.adapt(views[[3, 1, 5, 0, 2, 4]]).render(cameras).images
@@ -127,8 +127,8 @@ def test_views_without_masks_are_refused():
         SMALL.adapt(ball_views(ring(4), masks=False))
 
 
-def test_the_first_sample_in_the_hull_is_all_that_is_seen(monkeypatch):
-    """By the kernel, and by compositing all samples of an opaque field: the same samples, so the same pictures."""
+def test_rendering_the_first_sample_agrees_with_compositing_all(monkeypatch):
+    """The kernel, which stops at the first sample, is compared with compositing all samples of an opaque field."""
     monkeypatch.setattr(hull_blend, "ROUNDING", 0.0)
     blend = SMALL.adapt(ball_views(ring(7, (24, 24)), colour=(0.9, 0.5, 0.2)))
     cameras = ring(3, (40, 30), shift=1)
@@ -140,9 +140,9 @@ def test_the_first_sample_in_the_hull_is_all_that_is_seen(monkeypatch):
     assert first.samples < every.samples / 4
 
 
-def test_rays_begin_at_the_box_of_the_hull_and_lose_nothing(monkeypatch):
+def test_starting_rays_at_the_box_of_the_hull_does_not_change_pictures(monkeypatch):
     views, grid, cameras = ball_views(ring(8)), full(Sphere(), 20), ring(3, (30, 30), shift=1)
-    near = (grid.centres().norm(dim=1) < 0.8).reshape(20, 20, 20)  # without the corners, which no view shows
+    near = (grid.centres().norm(dim=1) < 0.8).reshape(20, 20, 20)  # without the corners, outside all views
     planes = VisibilityPlanes(views.images, views.cameras, views.masks, Occupancy(near, Sphere()))
     field = SMALL.adapt_to(planes)
     assert max(field.refined_occupancy.box) < 0.9
@@ -154,7 +154,7 @@ def test_rays_begin_at_the_box_of_the_hull_and_lose_nothing(monkeypatch):
         assert (found.samples == rendered.samples) == same
 
 
-def test_a_view_that_is_hidden_cuts_nothing_away(monkeypatch):
+def test_a_masked_view_does_not_carve_the_hull(monkeypatch):
     views = ball_views(ring(6, (24, 24)))
     nothing = Views(views.images, views.cameras, views.masks.index_fill(0, torch.tensor([4]), 0.0), views.bounds)
     planes = VisibilityPlanes(nothing.images, nothing.cameras, nothing.masks, hull(views, 20))
@@ -168,8 +168,8 @@ def test_a_view_that_is_hidden_cuts_nothing_away(monkeypatch):
 
 
 @pytest.mark.parametrize("masked", [[], [2]])
-def test_centres_of_voxels_lie_in_the_hull_where_every_view_shows_the_object(masked):
-    """By the kernel, and by the least opacity over the views of each centre; some views end within the scene."""
+def test_centres_of_voxels_are_in_the_hull_if_all_views_cover_them(masked):
+    """The kernel is compared with the least opacity of each centre over the views, some of which do not show it."""
     views = ball_views(ring(5, (24, 20), angle=0.5), radius=0.6)
     planes = VisibilityPlanes(views.images, views.cameras, views.masks, full(Sphere((0.1, 0.0, -0.1), 1.2), 19))
     planes = planes.mask_views(torch.tensor(masked, dtype=torch.long))
@@ -180,8 +180,8 @@ def test_centres_of_voxels_lie_in_the_hull_where_every_view_shows_the_object(mas
     assert 0.02 < inside.float().mean() < 0.5
 
 
-def test_where_no_view_sees_a_point_the_nearest_serve_whatever_hides_it():
-    """Within a ball every view is behind its surface, by more or less; the blend weighs them by angle alone."""
+def test_points_that_no_view_sees_are_coloured_by_the_nearest_views():
+    """A point inside the ball is occluded in all views; they are then weighted by angle alone."""
     colours = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 0.0), (0.0, 1.0, 1.0)]
     eyes = torch.nn.functional.normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(1)), dim=1) * 3
     support = painted(concatenate([camera_at(tuple(eye.tolist()), (32, 32)) for eye in eyes]), colours)

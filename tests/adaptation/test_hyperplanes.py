@@ -1,5 +1,5 @@
 """Sources of truth: theta + delta by hand, brute-force matching of views to planes, and properties (an untrained model
-is its target, permuted views make the same field, what is saved is read).
+is its target network, permuted views give the same field, a saved model is read back).
 """
 
 import json
@@ -38,8 +38,8 @@ def picture(model, support):
     return model.adapt(support).render(CAMERAS).images
 
 
-def test_an_untrained_model_is_its_target(model, support):
-    # the outputs of the hypernetwork start at zero: theta + delta = theta
+def test_an_untrained_model_is_its_target_network(model, support):
+    # the hypernetwork outputs zero at first, so that theta + delta = theta
     asleep = small_model()
     plain = small_model(hypernetwork=None)
     plain.networks.load_state_dict(asleep.networks.state_dict())
@@ -59,7 +59,7 @@ def test_adapting_binds_theta_plus_delta(model, support):
         assert torch.equal(one, other)
 
 
-def test_what_the_hypernetwork_reads(model, support):
+def test_the_hypernetwork_reads_images_with_directions_and_theta(model, support):
     """Eq. 7: k images of the support with the viewing directions of the same cameras, and theta."""
     seen = []
     model.hypernetwork.register_forward_pre_hook(lambda module, given: seen.append(given))
@@ -89,12 +89,12 @@ def test_a_scene_moved_and_scaled_with_its_cameras_gives_the_same_picture(model,
 
     there = replace(support, cameras=moved(support.cameras), bounds=Sphere(tuple(shift.tolist()), scale))
     images = model.adapt(there).render(moved(CAMERAS)).images
-    # rounding may move a sample across the side of a voxel
+    # rounding may move a sample into another voxel
     assert ((images - picture(model, support)).abs() < 1e-3).float().mean() > 0.98
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_fewer_views_than_planes_stand_for_several(model, support, count):
+def test_with_fewer_views_than_planes_views_are_repeated(model, support, count):
     arranged = model.arrange(support[:count])
     assert len(arranged) == 4
     sources = [int((support.images == image).flatten(1).all(1).nonzero()[0]) for image in arranged.images]
@@ -103,7 +103,7 @@ def test_fewer_views_than_planes_stand_for_several(model, support, count):
     assert torch.isfinite(picture(model, support[:count])).all()
 
 
-def test_of_more_views_the_ones_nearest_to_the_rig_are_taken(model, support):
+def test_with_more_views_than_planes_those_nearest_to_the_rig_are_used(model, support):
     others = ball_views(ring(5, shift=2))
     many = Views(torch.cat([others.images, support.images]), _joined(others, support))
     arranged = model.arrange(many)
@@ -116,15 +116,15 @@ def _joined(*parts):
     return pinhole(calibration(parts[0].cameras)[0], pose, *parts[0].size)
 
 
-def test_an_object_seen_from_farther_away_is_matched_by_direction(model, support):
+def test_views_from_farther_away_are_matched_by_direction(model, support):
     far = pinhole(calibration(support.cameras)[0], look_at(centres(support.cameras)[[2, 0, 3, 1]] * 2), 16, 16)
     arranged = model.arrange(replace(support, cameras=far))
     torch.testing.assert_close(centres(arranged.cameras), 2 * centres(support.cameras))
 
 
-def test_hyperplanes_are_spread_as_far_as_they_can_be():
+def test_hyperplanes_are_farthest_apart():
     wide = small_model(network=TargetConfig(depth=1, width=8, planes=6))
-    # six cameras on the axes; the farthest from the first is its opposite
+    # six cameras on the axes; the farthest one from the first is opposite
     eyes = 3 * torch.tensor([[0, 0, 1.0], [1, 0, 0], [0, 1, 0], [0, 0, -1], [-1, 0, 0], [0, -1, 0]])
     cameras = pinhole(torch.tensor([[20.0, 0, 7.5], [0, 20, 7.5], [0, 0, 1]]), look_at(eyes), 16, 16)
     wide.set_rig(ball_views(cameras))
@@ -138,7 +138,7 @@ def test_hyperplanes_are_k_different_planes(count):
     assert len(set(chosen)) == len(chosen) == count
 
 
-def test_the_first_hyperplanes_are_read_when_asked_for(support):
+def test_the_first_views_are_hyperplanes_with_choice_first(support):
     config = ImageHyperNetworkConfig(views=3, choice="first", normalisation="group", code=8, depth=2, width=16)
     first, farthest = small_model(hypernetwork=config), small_model(hypernetwork=replace(config, choice="farthest"))
     assert first.prepare(support).hyperplanes.tolist() == [0, 1, 2]
@@ -162,7 +162,7 @@ def test_planes_in_the_order_of_their_file_are_the_first_views(count, expected):
         ModelConfig(order="random")
 
 
-def test_no_view_at_all_is_refused(model, support):
+def test_no_views_are_refused(model, support):
     with pytest.raises(ValueError, match="support: expected at least one view, got none"):
         model.adapt(support[:0])
     with pytest.raises(ValueError, match="support: expected at least 4 views, one a plane, got 3"):
@@ -234,14 +234,14 @@ def test_a_configuration_that_does_not_fit_is_a_checkpoint_error(change):
     assert "\n" not in str(caught.value)
 
 
-def test_a_field_of_a_package_that_is_not_installed_is_said_to_be_one():
+def test_the_error_for_an_unknown_field_names_a_missing_package():
     value = {**ModelConfig().as_json(), "target": "of_a_plugin"}
     with pytest.raises(CheckpointError, match="got 'of_a_plugin'; install the package that adds it"):
         ModelConfig.of_json(value)
 
 
 @pytest.mark.parametrize("missing", ["network", "sampling", "protocol", "hypernetwork"])
-def test_a_configuration_with_a_hole_is_a_checkpoint_error(missing):
+def test_a_missing_entry_of_a_configuration_is_a_checkpoint_error(missing):
     value = ModelConfig().as_json()
     del value[missing]
     with pytest.raises(CheckpointError, match=missing):
@@ -330,7 +330,7 @@ def test_a_packaged_model_is_found_by_its_name(model, tmp_path, monkeypatch):
     with pytest.raises(CheckpointError, match=r"boats-8: expected .* packaged model \(cars-8\), found neither; "):
         HyperPlanes.from_pretrained("boats-8")
     with pytest.raises(CheckpointError, match="runs/boats-8: expected a checkpoint's folder, found no such folder"):
-        HyperPlanes.from_pretrained("runs/boats-8")  # a path is a path
+        HyperPlanes.from_pretrained("runs/boats-8")  # a path is not looked up among the packaged models
 
 
 def test_a_loaded_model_can_be_trained_further(model, tmp_path):
@@ -339,7 +339,7 @@ def test_a_loaded_model_can_be_trained_further(model, tmp_path):
     assert all(value.requires_grad and value.device.type == "cpu" for value in again.parameters())
 
 
-def test_the_seed_decides_the_weights_and_global_randomness_does_not():
+def test_the_weights_depend_on_the_seed_and_not_on_the_global_generator():
     config = small_model().config
     before = torch.random.get_rng_state()
     first, second, third = HyperPlanes(config, 1), HyperPlanes(config, 1), HyperPlanes(config, 2)
@@ -349,14 +349,14 @@ def test_the_seed_decides_the_weights_and_global_randomness_does_not():
     assert not torch.equal(weights[0], weights[2])
 
 
-def test_a_model_that_was_never_shown_its_rig_is_refused(support):
+def test_a_model_without_a_rig_is_refused(support):
     fresh = HyperPlanes(small_model().config)
     for call in (fresh.prepare, fresh.arrange, fresh.adapt):
         with pytest.raises(ValueError, match="rig: expected the camera directions of the training views, got none"):
             call(support)
 
 
-def test_weights_are_found_in_one_way():
+def test_a_hypernetwork_and_an_autoencoder_together_are_refused():
     with pytest.raises(ValueError, match="expected at most one way to find weights, got hypernetwork and autoencoder"):
         ModelConfig(autoencoder=AutoencoderConfig())
 
@@ -379,13 +379,13 @@ def test_adapting_and_fine_tuning_leave_the_model_in_its_mode(support):
     assert torch.equal(picture(batch, support), picture(batch.eval(), support))
 
 
-def test_views_in_double_precision_are_taken_to_where_the_weights_are(model, support):
+def test_views_in_double_precision_are_converted_to_the_type_of_the_weights(model, support):
     double = support.to(dtype=torch.float64)
     torch.testing.assert_close(picture(model, double), picture(model, support), atol=1e-4, rtol=0)
     model.fine_tune(double, 1, FineTuning(rays=8))
 
 
-def test_without_a_hull_one_voxel_holds_everything(model, support):
+def test_without_carving_the_hull_is_one_occupied_voxel(model, support):
     prepared = model.prepare(support, carved=False)
     assert prepared.occupancy.occupied.shape == (1, 1, 1)
     assert prepared.occupancy.occupied.all()
@@ -411,7 +411,7 @@ def test_a_new_model_leaves_the_generators_of_all_devices_alone(monkeypatch):
     assert all(torch.equal(value, other.state_dict()[name]) for name, value in one.state_dict().items())
 
 
-def test_a_module_is_in_use_until_the_last_of_its_users_has_ended():
+def test_a_module_is_in_evaluation_mode_until_its_last_user_ends():
     model = small_model().train()
     model.networks.eval()
     first, second = in_use(model), in_use(model)

@@ -1,4 +1,4 @@
-"""Fields kept on disk. Source of truth: the field that was kept, and a key that changes with all that matters."""
+"""The cache of fields on disk. Source of truth: the stored field, and a key that changes with every input."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def field(model, views):
     return model.adapt(views)
 
 
-def test_a_kept_field_is_the_field(model, views, field):
+def test_a_cached_field_is_read_back(model, views, field):
     folder = kept_folder(model, views, 0, FineTuning())
     assert recall_field(folder, views) is None
     keep_field(model, field, folder)
@@ -50,7 +50,7 @@ def test_a_kept_field_is_the_field(model, views, field):
     assert recall_field(folder, views) is None
 
 
-def test_the_folder_is_another_for_other_views_weights_and_options(model, views):
+def test_the_folder_depends_on_views_steps_and_options(model, views):
     settings = FineTuning()
     folders = [kept_folder(model, each, steps, settings) for each in (views, views[:3]) for steps in (0, 1, "auto")]
     folders.append(kept_folder(model, replace(views, images=views.images.flip(0)), 0, settings))
@@ -60,7 +60,7 @@ def test_the_folder_is_another_for_other_views_weights_and_options(model, views)
     assert kept_folder(model, views, 0, settings) == folders[0]
 
 
-def test_the_oldest_go(model, views, field, tmp_path):
+def test_the_oldest_fields_are_removed(model, views, field, tmp_path):
     for number in range(MOST):
         (tmp_path / "adapted" / f"old{number}").mkdir(parents=True)
     keep_field(model, field, kept_folder(model, views, 0, FineTuning()))

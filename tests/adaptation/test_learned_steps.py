@@ -1,4 +1,4 @@
-"""Source of truth: the gradient of the mean loss by autograd, differences of that loss, and steps that are none."""
+"""Sources of truth: finite differences of the loss, and cases in which there are no learned steps."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("all_rays")
 
 
 def stepping(steps=1):
-    """A model whose learned steps go against the gradient."""
+    """A model whose learned steps are steps of gradient descent."""
     made = HyperPlanes(replace(CONFIG, stacked=False, learned_steps=steps))
     made.load_state_dict(model().state_dict(), strict=False)
     made.learned_step.rates.fill_(1.0)
@@ -33,7 +33,7 @@ def generator(seed=0):
 
 
 def error_and_gradient(adapter, context, weights, rays, seed=0):
-    """The error whose gradient is found, and the gradient."""
+    """The error and its gradient."""
     errors, find = [], learned_steps.summed_gradients
 
     def kept(*inputs, **options):
@@ -47,7 +47,7 @@ def error_and_gradient(adapter, context, weights, rays, seed=0):
     return errors[0], gradient
 
 
-def test_the_gradient_is_that_of_the_error():
+def test_the_gradient_agrees_with_finite_differences():
     adapter = stepping().double()
     context = adapter.prepare(ball_views(ring(5)))
     weights = adapter.adapted_weights(context)
@@ -61,7 +61,7 @@ def test_the_gradient_is_that_of_the_error():
     assert error > 0
 
 
-def test_rays_come_from_views_that_the_field_is_not_shown(monkeypatch):
+def test_rays_come_from_masked_views(monkeypatch):
     masked, adapter = [], stepping()
     context = adapter.prepare(ball_views(ring(13)))
     kind = type(context)
@@ -93,7 +93,7 @@ def test_steps_lower_the_error_and_are_the_same_each_time():
 
 
 @pytest.mark.parametrize(("views", "expected"), [(2, 5), (19, 5), (20, 3), (22, 3)])
-def test_of_many_views_half_as_many_steps_are_taken(views, expected, monkeypatch):
+def test_with_many_views_half_as_many_steps_are_taken(views, expected, monkeypatch):
     taken, adapter = [], stepping(5)
     context = adapter.prepare(ball_views(ring(views)))
 
@@ -112,7 +112,7 @@ def changed(adapter, support, **options):
     return not torch.equal(updated_weights(adapter, context)[GRID], adapter.adapted_weights(context)[GRID])
 
 
-def test_there_are_none_for_a_single_view_nor_without_masks():
+def test_there_are_no_learned_steps_for_a_single_view_or_without_masks():
     views, plane = ball_views(ring(3)), Symmetry(Plane((1.0, 0.0, 0.0)))
     assert changed(stepping(), views)
     assert changed(stepping(), views, symmetry=plane)
@@ -122,7 +122,7 @@ def test_there_are_none_for_a_single_view_nor_without_masks():
     assert not changed(model(), views)
 
 
-def test_they_are_taken_in_inference_mode_too():
+def test_learned_steps_work_in_inference_mode():
     adapter, support = stepping(), ball_views(ring(4))
     plain = adapter.adapt(support).render(support.cameras).images
     with torch.inference_mode():
@@ -130,7 +130,7 @@ def test_they_are_taken_in_inference_mode_too():
     assert torch.equal(plain, made)
 
 
-def test_a_checkpoint_keeps_them(tmp_path):
+def test_learned_steps_are_saved_in_a_checkpoint(tmp_path):
     adapter, support = stepping(), ball_views(ring(3))
     adapter.save(tmp_path)
     found = HyperPlanes.from_pretrained(tmp_path)
@@ -139,7 +139,7 @@ def test_a_checkpoint_keeps_them(tmp_path):
     )
 
 
-def test_the_weights_of_one_object_take_none():
+def test_the_weights_of_one_object_take_no_learned_steps():
     adapter, support = stepping(), ball_views(ring(3))
     adapted = adapter.adapt(support)
     alone = adapter.with_weights_of(adapted)
@@ -149,12 +149,12 @@ def test_the_weights_of_one_object_take_none():
     )
 
 
-def test_what_has_no_grid_takes_none():
+def test_learned_steps_without_a_grid_are_refused():
     with pytest.raises(ValueError, match="learned_steps: expected 0 without a hypernetwork of kind 'volume', got 2"):
         HyperPlanes(replace(CONFIG, hypernetwork=None, learned_steps=2))
 
 
-def test_the_update_of_another_object_is_followed_by_steps_too():
+def test_a_swapped_update_is_followed_by_learned_steps():
     adapter, views = stepping(), [ball_views(ring(4)), ball_views(ring(4), colour=(0.1, 0.3, 0.9), radius=0.4)]
     context = adapter.prepare(views[0])
     foreign = adapter.theta + adapter.update(adapter.prepare(views[1]))
@@ -163,7 +163,7 @@ def test_the_update_of_another_object_is_followed_by_steps_too():
     torch.testing.assert_close(Swapped(adapter, views).adapt(views[0]).field.parameters["grid.weight"], expected)
 
 
-def test_training_makes_a_step_that_shows_query_views_better_and_leaves_the_model_alone(monkeypatch):
+def test_training_gives_a_step_that_improves_query_views_and_does_not_change_the_model(monkeypatch):
     adapter, data = stepping(1), Balls(views=6)
     config = TrainingConfig(steps=14, tasks=1, rays=64, views=(2, 3, 4), held_out=0)
     before, done = {name: value.clone() for name, value in adapter.state_dict().items()}, []
@@ -176,16 +176,16 @@ def test_training_makes_a_step_that_shows_query_views_better_and_leaves_the_mode
     assert done == list(range(1, 15))
     assert not any(value.requires_grad for value in fitted.parameters())
     assert all(torch.equal(value, before[name]) for name, value in adapter.state_dict().items())
-    # on objects that it was not trained on
+    # evaluated on a held-out object
     task, errors = data.task("test0"), []
     for steps in (0, 1):
         adapter.learned_step, adapter.config = fitted, replace(adapter.config, learned_steps=steps)
         pictures = adapter.adapt(task.support[:3]).render(task.query.cameras).images
         errors.append(float((pictures - task.query.images).square().mean()))
-    assert errors[1] < errors[0] - 5e-5  # measured: 7e-5, and 7e-7 by a step that is not trained
+    assert errors[1] < errors[0] - 5e-5  # measured: 7e-5, and 7e-7 with an untrained step
 
 
-def test_training_goes_on_from_the_step_that_the_model_has(monkeypatch):
+def test_training_starts_from_the_step_of_the_model(monkeypatch):
     monkeypatch.setattr(training, "RATE", 0.0)
     adapter = stepping(1)
     config = TrainingConfig(steps=1, tasks=2, rays=64, views=(2, 3), held_out=0)
@@ -195,8 +195,8 @@ def test_training_goes_on_from_the_step_that_the_model_has(monkeypatch):
     assert fitted is not adapter.learned_step
 
 
-def test_training_begins_with_each_of_the_first_steps(monkeypatch):
-    """The step that is trained follows none, one, two or three others."""
+def test_training_covers_the_first_four_steps(monkeypatch):
+    """The trained step comes after none, one, two or three others."""
     followed, adapter = [], stepping(1)
     read = (None, None, torch.zeros_like(adapter.theta[GRID])[None])
     monkeypatch.setattr(training, "step_inputs", lambda *inputs, **options: followed.append(1) or read)

@@ -16,7 +16,7 @@ def support(count=5, size=(12, 16), bounds=None):
     return Views(images, ring(count, size), bounds=bounds or Sphere())
 
 
-def test_seen_from_a_support_camera_it_is_that_image():
+def test_the_picture_of_a_support_camera_is_its_image():
     views, order = support(), torch.tensor([3, 0, 4, 1, 2])
     pictures = NearestView().adapt(views).render(select(views.cameras, order))
     assert torch.equal(pictures.images, views.images[order])
@@ -28,7 +28,7 @@ def test_the_nearest_direction_counts_from_the_centre_of_the_scene():
     cameras = concatenate([camera_at((2.0, 0.0, 0.0)), camera_at((0.0, 0.0, 4.0))])
     images = torch.stack([torch.zeros(3, 16, 16), torch.ones(3, 16, 16)])
     views = Views(images, cameras, bounds=Sphere((0.0, 0.0, 1.0), 1.0))
-    # from (2, 0, 2.2), direction (2, 0, 1.2): nearer to the second (0.51 against 0.54 with the first)?
+    # from (2, 0, 2.2), direction (2, 0, 1.2): nearer to the first
     # cos to (2, 0, -1): (4 - 1.2) / (2.332 * 2.236) = 0.537; cos to (0, 0, 3): 1.2 / 2.332 = 0.515
     asked = concatenate([camera_at((2.0, 0.0, 2.2)), camera_at((2.0, 0.0, 2.5))])
     # from (2, 0, 2.5), direction (2, 0, 1.5): cos 2.5 / (2.5 * 2.236) = 0.447 against 1.5 / 2.5 = 0.6
@@ -36,7 +36,7 @@ def test_the_nearest_direction_counts_from_the_centre_of_the_scene():
     assert pictures.images.flatten(1).mean(1).tolist() == [0.0, 1.0]
 
 
-def test_a_distance_does_not_matter():
+def test_the_distance_of_the_camera_does_not_matter():
     near = camera_at((0.0, 0.3, 9.0), (12, 16))
     views = support()
     picture = NearestView().adapt(views).render(near).images
@@ -47,14 +47,14 @@ def test_a_distance_does_not_matter():
 
 
 def seen(views, focal, middle, size):
-    """What is copied for the first camera with another lens."""
+    """The picture of the first camera with other intrinsics."""
     matrix = torch.tensor([[focal[0], 0, middle[0]], [0, focal[1], middle[1]], [0, 0, 1.0]])
     asked = pinhole(matrix, views.cameras.extrinsics[:1], *size)
     return NearestView().adapt(views).render(asked)
 
 
-def test_a_page_of_another_aspect_shows_more_and_stretches_nothing():
-    # a lens of the same focal length whose picture is 4 columns wider and 3 rows lower, one of them above
+def test_an_image_of_another_aspect_ratio_is_padded_and_not_stretched():
+    # the same focal length; the image is 4 columns wider and 3 rows lower, and its first row is cut off
     views = support()
     (fx, fy), (cx, cy) = views.cameras.intrinsics[0, [0, 1], [0, 1]], views.cameras.intrinsics[0, :2, 2]
     found = seen(views, (fx, fy), (cx + 2, cy - 1), (9, 20))
@@ -65,8 +65,8 @@ def test_a_page_of_another_aspect_shows_more_and_stretches_nothing():
     assert (found.opacity[0, :, :, 2:18] == 1).all()
 
 
-def test_a_longer_lens_shows_the_middle_by_bilinear_interpolation():
-    # u of the asked camera is (u - 4) / 2 + 7.5 of the copy, v likewise: every other one lies between two pixels
+def test_a_longer_focal_length_magnifies_the_middle_by_bilinear_interpolation():
+    # column u of the new camera is column (u - 4) / 2 + 7.5 of the copied image, and rows likewise
     views = support()
     fx, fy = views.cameras.intrinsics[0, [0, 1], [0, 1]]
     found = seen(views, (2 * fx, 2 * fy), (4.0, 4.0), (9, 9)).images[0]
@@ -76,22 +76,22 @@ def test_a_longer_lens_shows_the_middle_by_bilinear_interpolation():
     torch.testing.assert_close(found[:, 3, 5], pixels[:, 5, 8], atol=1e-4, rtol=0)
 
 
-def test_fewer_pixels_are_means():
-    # black and white columns in turn are grey, away from the borders, and the whole picture is seen
+def test_smaller_pictures_are_averaged():
+    # alternating black and white columns become grey away from the borders, and the opacity is 1
     views = Views(torch.arange(2).repeat(8).expand(1, 3, 16, 16).float(), ring(1, (16, 16)))
     small = NearestView().adapt(views).render(resized(views.cameras, 4, 4))
     torch.testing.assert_close(small.images[..., 1:3], torch.full((1, 3, 4, 2), 0.5), atol=0.02, rtol=0)
     torch.testing.assert_close(small.opacity, torch.ones(1, 1, 4, 4))
 
 
-def test_a_distorted_lens_moves_pixels_as_opencv_does():
+def test_lens_distortion_agrees_with_opencv():
     views = support()
     (fx, fy), (cx, cy) = views.cameras.intrinsics[0, [0, 1], [0, 1]], views.cameras.intrinsics[0, :2, 2]
     bent = distorted(select(views.cameras, [0]), torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0]))
     one = Views(views.images[:1], bent)
     assert torch.equal(NearestView().adapt(one).render(bent).images, one.images)
     found = seen(one, (fx, fy), (cx, cy), (12, 16)).images[0]
-    # pixel (7, 3) of the straight lens: (-0.5 / fx, -2.5 / fy) times 1 + k1 r^2 in the copy
+    # pixel (7, 3) of the undistorted camera: (-0.5 / fx, -2.5 / fy) times 1 + k1 r^2 in the copied image
     x, y = -0.5 / fx, -2.5 / fy
     factor = 1 + 0.1 * (x * x + y * y)
     u, v = factor * x * fx + cx, factor * y * fy + cy
@@ -103,7 +103,7 @@ def test_a_distorted_lens_moves_pixels_as_opencv_does():
     torch.testing.assert_close(found[:, 3, 7], expected, atol=1e-4, rtol=0)
 
 
-def test_the_opacity_is_the_mask_of_the_copied_view_and_one_without_masks():
+def test_the_opacity_is_the_mask_of_the_copied_view_or_1_without_masks():
     plain = support()
     masked = Views(plain.images, plain.cameras, (plain.images[:, :1] > 0.5).float())
     order = torch.tensor([2, 0])

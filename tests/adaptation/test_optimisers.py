@@ -21,7 +21,7 @@ def test_an_orthogonalised_matrix_has_singular_values_near_one_and_the_same_vect
     assert 0.65 < inner.diag().min() < inner.diag().max() < 1.25
 
 
-def test_steps_are_those_of_torch_but_for_its_precision():
+def test_steps_of_muon_agree_with_torch():
     # Another implementation: torch.optim.Muon, which iterates in bfloat16.
     if not hasattr(torch.optim, "Muon"):
         pytest.skip("this torch has no Muon to compare with")
@@ -40,8 +40,8 @@ def test_steps_are_those_of_torch_but_for_its_precision():
 
 
 @pytest.mark.parametrize(("device", "shared"), [("cpu", True), ("meta", False)])
-def test_what_is_not_on_a_cpu_stays_in_the_thread_that_steps(monkeypatch, device, shared):
-    # Other threads have streams of their own on a GPU, which do not wait for the gradients of this one.
+def test_tensors_that_are_not_on_a_cpu_are_stepped_in_the_calling_thread(monkeypatch, device, shared):
+    # Other threads have their own streams on a GPU, which do not wait for the gradients of this thread.
     seen = []
     monkeypatch.setattr(
         "hyperplanes.adaptation.optimisers.orthogonalise", lambda value: seen.append(get_ident()) or value

@@ -1,6 +1,6 @@
-"""Poses that are disturbed on purpose come back.
+"""Tests of pose refinement.
 
-Source of truth: the poses that the pictures of example-car were rendered from, disturbed here by known motions.
+Source of truth: the poses from which the images of example-car were rendered, perturbed here by known motions.
 """
 
 import math
@@ -36,8 +36,8 @@ def few_steps(monkeypatch):
     monkeypatch.setattr(pose_refinement, "FIXED", 0)
 
 
-def disturbed(views):
-    """Each camera turned by two degrees about an axis through it, and moved by as much of its distance."""
+def perturbed(views):
+    """Views whose cameras are rotated by two degrees and moved by 0.035 of their distance, in random directions."""
     generator = torch.Generator().manual_seed(0)
     draw = torch.nn.functional.normalize(torch.randn(2, len(views), 3, generator=generator), dim=-1)
     turn, shift = draw * math.radians(DEGREES)
@@ -49,7 +49,7 @@ def disturbed(views):
 
 
 def epipolar_error(cameras, views):
-    """Median Sampson error in pixels of points on the object that the true cameras see: no common motion changes it."""
+    """The median Sampson error in pixels of points on the object. A common motion of all cameras does not change it."""
     points = torch.randn(60, 3, generator=torch.Generator().manual_seed(1)) * 0.3
     pixels = views.cameras.project(points.expand(len(views), -1, 3)).double()
     pose, matrix = camera.camera_from_world(cameras).double(), camera.intrinsics(cameras).double()
@@ -63,8 +63,8 @@ def epipolar_error(cameras, views):
     return float(torch.cat(errors).median())
 
 
-def test_disturbed_poses_come_back(views):
-    wrong, told = disturbed(views), []
+def test_perturbed_poses_are_recovered(views):
+    wrong, told = perturbed(views), []
     before = epipolar_error(wrong.cameras, views)
     found = refine_poses(wrong, on_step=lambda done, total: told.append((done, total)))
     assert before > 1
@@ -75,14 +75,14 @@ def test_disturbed_poses_come_back(views):
     assert found.turned.shape == (len(views),)
 
 
-def test_a_motion_that_all_cameras_have_in_common_is_none(views):
+def test_a_common_motion_of_all_cameras_is_removed(views):
     moving = pose_refinement._MovedCameras(views.cameras, views.bounds)
     with torch.no_grad():
         moving.twist[:] = torch.tensor([0.3, -0.2, 0.1, 0.2, 0.4, -0.1])
     torch.testing.assert_close(moving().extrinsics, views.cameras.extrinsics, atol=1e-5, rtol=0)
 
 
-def test_what_cannot_be_refined_is_refused(views):
+def test_few_views_and_lens_distortion_are_refused(views):
     with pytest.raises(ValueError, match="views: expected at least 5 without lens distortion to refine poses, got 4"):
         refine_poses(views[:4])
     bent = replace(views, cameras=distorted(views.cameras, torch.full((5,), 1e-3)))
@@ -91,10 +91,10 @@ def test_what_cannot_be_refined_is_refused(views):
 
 
 @pytest.mark.parametrize(("better", "said"), [(True, "poses: refined, turned by "), (False, "poses: as given, ")])
-def test_views_left_out_decide_and_what_was_found_is_kept(views, capsys, monkeypatch, tmp_path, better, said):
-    """The judge's figures are given here; the poses of the one or the other come out, for support and query alike.
+def test_held_out_views_decide_and_the_result_is_cached(views, capsys, monkeypatch, tmp_path, better, said):
+    """The PSNR of held-out views is given here; the poses of support and query views are the given or the refined ones.
 
-    The same call again, with a refinement that fails, ends with the same.
+    A second call gives the same result from the cache, without another refinement.
     """
     from hyperplanes.evaluation import suitability
 

@@ -1,4 +1,4 @@
-"""Sources of truth: a loop over pixels and support views, and a ball whose pictures are known."""
+"""Sources of truth: a loop over pixels and support views, and a ball in closed form."""
 
 import copy
 import math
@@ -42,7 +42,7 @@ def towards(one):
 
 
 class Counting:
-    """A field that counts the pictures that are asked for."""
+    """A field that counts the rendered pictures."""
 
     def __init__(self, field):
         self.field, self.rendered = field, 0
@@ -62,7 +62,7 @@ def query():
     return ball_views(ring(6, SIZE, shift=1))[::2]
 
 
-def test_a_field_of_a_wrong_colour_is_corrected_and_by_other_views_it_is_not(support, query):
+def test_residuals_correct_a_wrong_colour_and_those_of_wrong_views_do_not(support, query):
     grey = ball((0.5, 0.5, 0.5))
     plain, corrected = (
         float(psnr(each.render(query.cameras).images, query.images).mean())
@@ -76,7 +76,7 @@ def test_a_field_of_a_wrong_colour_is_corrected_and_by_other_views_it_is_not(sup
         assert psnr(ResidualField(grey, wrong).render(query.cameras).images, query.images).mean() < corrected - 0.5
 
 
-def test_of_what_a_field_shows_already_nothing_is_added(query):
+def test_residuals_of_a_field_that_matches_the_views_are_zero(query):
     grey = ball((0.5, 0.5, 0.5))
     cameras = ring(6, SIZE)
     views = Views(grey.render(cameras).images, cameras, None, Sphere())
@@ -89,7 +89,7 @@ def scene(name):
     """A field, its support views and a new camera."""
     if name == "ball":
         return ball((0.5, 0.5, 0.5)), ball_views(ring(24, SIZE)), camera_at((0.4, 0.8, 2.9), SIZE)
-    # mist beside the origin, and support views so near that they show parts of it
+    # fog away from the origin, and support views so near that each shows only a part
     centre, bounds = (3.0, -2.0, 1.0), Sphere((3.0, -2.0, 1.0), 2.0)
 
     def mist(points, directions):
@@ -104,7 +104,7 @@ def scene(name):
 
 
 @pytest.mark.parametrize("name", ["ball", "mist"])
-def test_a_pixel_has_the_weighted_residuals_of_a_loop_over_the_views(name):
+def test_corrected_pixels_agree_with_a_loop_over_the_views(name):
     field, support, asked = scene(name)
     plain, found = field.render(asked), ResidualField(field, support).render(asked).images[0]
     own, faint, outside, changed = field.render(support.cameras), 0, 0, 0
@@ -146,8 +146,8 @@ def test_a_pixel_has_the_weighted_residuals_of_a_loop_over_the_views(name):
     assert name == "ball" or (faint > 5 and outside > 5)
 
 
-def test_views_that_another_surface_hides_add_nothing():
-    # A large ball hides the small one behind it from the only view: what that view lacks is not the small one's.
+def test_views_in_which_a_point_is_occluded_add_no_residuals():
+    # In the only view, a large ball occludes a small one, so that its residuals do not belong to the small one.
     def two(points, directions):
         near, far = points.norm(dim=-1) < 0.3, (points - points.new_tensor([0.0, 0.0, -0.8])).norm(dim=-1) < 0.15
         return torch.full_like(points, 0.5), 400.0 * (near | far)
@@ -155,18 +155,18 @@ def test_views_that_another_surface_hides_add_nothing():
     field = AdaptedField(two, full(Sphere(), 32), RayMarching(96, 0.02))
     front, aside = camera_at((0.0, 0.0, 3.0), (48, 48)), camera_at((2.2, 0.0, 2.0), (48, 48))
     plain = field.render(aside)
-    view = Views(1 - field.render(front).images, front, None, Sphere())  # it lacks a lot
+    view = Views(1 - field.render(front).images, front, None, Sphere())  # large residuals
     added = (ResidualField(field, view).render(aside).images - plain.images).abs().sum(1)[0]
     small = plain.depth[0, 0] > 3.2
     assert small.sum() > 10
     assert added[small].max() < 0.01 < added.max()
 
 
-def test_only_views_from_that_side_are_rendered_and_each_of_them_once(support):
+def test_only_views_from_the_same_side_are_rendered_and_each_only_once(support):
     counting = Counting(ball((0.5, 0.5, 0.5)))
     corrected = ResidualField(counting, support)
     asked = camera_at((0.0, 0.0, 3.0), SIZE)
-    near = int((support.camera_directions @ towards(asked) > 0.5).sum())  # of the middle of the ball
+    near = int((support.camera_directions @ towards(asked) > 0.5).sum())  # views from the same side
     first = corrected.render(asked).images
     rendered = counting.rendered - 1
     assert near <= rendered <= near + 6 < 16
@@ -180,7 +180,7 @@ def test_only_views_from_that_side_are_rendered_and_each_of_them_once(support):
     assert counting.rendered == 2 + 24 + 24
 
 
-def test_many_cameras_show_what_each_shows_alone_and_opacity_and_depth_stay(support, query):
+def test_pictures_are_corrected_independently_and_opacity_and_depth_do_not_change(support, query):
     grey = ball((0.5, 0.5, 0.5))
     corrected, plain = ResidualField(grey, support), grey.render(query.cameras)
     together = corrected.render(query.cameras)
@@ -192,7 +192,7 @@ def test_many_cameras_show_what_each_shows_alone_and_opacity_and_depth_stay(supp
         torch.testing.assert_close(together.images[view], alone, atol=1e-5, rtol=0)
 
 
-def test_a_view_fades_out_before_it_is_left_out():
+def test_the_weight_of_a_view_decreases_continuously_to_zero():
     field = ball((0.5, 0.5, 0.5))
     support = ball_views(camera_at((0.0, 0.0, 3.0), SIZE))
     added = []
@@ -206,7 +206,7 @@ def test_a_view_fades_out_before_it_is_left_out():
     assert added[-1] < 1e-6
 
 
-def test_where_nothing_is_seen_nothing_is_added(support):
+def test_empty_pictures_are_not_corrected(support):
     away = camera_at((0.0, 0.0, 3.0), SIZE, target=(0.0, 0.0, 9.0))
     assert torch.equal(ResidualField(ball((0.5, 0.5, 0.5)), support).render(away).images, torch.ones(1, 3, *SIZE))
 
@@ -218,14 +218,14 @@ def test_a_copy_is_independent(support, query):
     assert torch.equal(again.render(query.cameras).images, first)
 
 
-def test_from_the_other_side_alone_nothing_is_known():
+def test_views_from_the_other_side_add_no_residuals():
     back = ball_views(camera_at((0.0, 0.0, -3.0), SIZE))
     grey, asked = ball((0.5, 0.5, 0.5)), camera_at((0.0, 0.0, 3.0), SIZE)
     assert torch.equal(ResidualField(grey, back).render(asked).images, grey.render(asked).images.clamp(0, 1))
 
 
 def test_a_corrected_field_can_be_corrected_again(support, query):
-    """By a thread of its own, which would wait for itself."""
+    """In a separate thread, so that a deadlock does not block the tests."""
     found = []
     again = ResidualField(ResidualField(ball((0.5, 0.5, 0.5)), support), support)
     thread = Thread(target=lambda: found.append(again.render(query.cameras)), daemon=True)
@@ -235,7 +235,7 @@ def test_a_corrected_field_can_be_corrected_again(support, query):
 
 
 def model(**settings):
-    """A model whose pictures are corrected."""
+    """A model with residual correction."""
     made = HyperPlanes(replace(test_stacking.CONFIG, stacked=False, residuals=True, **settings))
     made.load_state_dict(test_stacking.model().state_dict(), strict=False)
     return made.eval()
@@ -243,7 +243,7 @@ def model(**settings):
 
 @pytest.fixture(scope="module")
 def many():
-    """As many views as correct the pictures of such a model."""
+    """As many views as residual correction needs."""
     return ball_views(ring(MANY_VIEWS, SIZE))
 
 
@@ -261,7 +261,7 @@ def test_a_model_corrects_the_pictures_of_its_fields(many, query, azimuth):
     assert not isinstance(field.with_sampling(RayMarching(12)), CorrectedField)
 
 
-def test_pictures_of_few_or_large_views_and_those_without_masks_stay_as_they_are(many, monkeypatch):
+def test_pictures_of_few_or_large_views_or_without_masks_are_not_corrected(many, monkeypatch):
     assert isinstance(model().adapt(many), CorrectedField)
     for others in (many[: MANY_VIEWS - 1], replace(many, masks=None)):
         assert not isinstance(model().adapt(others), CorrectedField)
@@ -270,14 +270,14 @@ def test_pictures_of_few_or_large_views_and_those_without_masks_stay_as_they_are
     assert not isinstance(model().adapt(many), CorrectedField)
 
 
-def test_gradient_steps_random_weights_and_the_update_of_another_object_are_corrected_too(many):
+def test_fine_tuned_random_and_swapped_fields_are_corrected_too(many):
     adapter, other = model(), ball_views(ring(MANY_VIEWS, SIZE), colour=(0.1, 0.3, 0.9))
     assert isinstance(FineTuned(adapter, 1).adapt(many), CorrectedField)
     assert isinstance(FromScratch(adapter, 1).adapt(many), CorrectedField)
     assert isinstance(Swapped(adapter, [many, other]).adapt(many), CorrectedField)
 
 
-def test_a_field_that_was_kept_is_corrected_as_it_was(many, query, tmp_path):
+def test_a_cached_field_is_corrected_in_the_same_way(many, query, tmp_path):
     adapter = model(azimuth=0.7)
     field = adapter.adapt(many)
     keep_field(adapter, field, tmp_path / "kept")

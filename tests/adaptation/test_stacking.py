@@ -1,4 +1,4 @@
-"""Source of truth: the minimum of a quadratic function by a grid, means of pictures, and which views may decide."""
+"""Sources of truth: the minimum of a quadratic function on a grid, means of pictures, and which views are held out."""
 
 import threading
 from dataclasses import replace
@@ -55,13 +55,13 @@ def model(seed=0, *, empty=False):
     with torch.no_grad():
         made.networks["fine"].density.weight *= 5
         made.networks["fine"].colour.weight *= 5
-        if empty:  # what was learned is that there is nothing
+        if empty:  # the learned field is empty
             made.theta["fine.density.bias"].fill_(-50)
     return made
 
 
 def both(support, symmetry=None):
-    """A learned field and the hull of the same views, and of their reflections."""
+    """The learned field and the hull blend of the same views and, with a symmetry, of their reflections."""
     adapter = model()
     context = adapter.prepare(support, symmetry=symmetry)
     return adapter.rendering_field(context, adapter.adapted_weights(context)), HullBlend().adapt_to(context.planes)
@@ -69,7 +69,7 @@ def both(support, symmetry=None):
 
 @cache
 def both_of_reflected():
-    """Those of seven views and their reflections."""
+    """Both fields of seven views and their reflections."""
     return both(ball_views(ring(7, (24, 24))), ACROSS)
 
 
@@ -88,7 +88,7 @@ def test_the_best_share_has_the_least_squared_error_of_a_grid():
         assert best_share(one, other) == pytest.approx(float(grid[errors.argmin()]), abs=1e-3)
 
 
-def test_the_share_of_a_prediction_that_is_right_is_one_and_of_one_that_brings_nothing_zero():
+def test_the_share_of_a_perfect_prediction_is_1_and_of_a_useless_one_0():
     error = torch.rand(7, 3) + 0.1
     assert best_share(error, torch.zeros(7, 3)) == 1
     assert best_share(torch.zeros(7, 3), error) == 0
@@ -126,7 +126,7 @@ def test_two_threads_make_the_pictures_of_one():
 
 
 @pytest.mark.parametrize("safe", [True, False])
-def test_fields_that_are_not_safe_in_threads_are_rendered_by_one(safe):
+def test_fields_that_are_not_thread_safe_are_rendered_in_one_thread(safe):
     ran, before = set(), torch.get_num_threads()
 
     class Plain:
@@ -164,7 +164,7 @@ def test_a_model_in_double_precision_is_stacked_too():
     )
 
 
-def test_densities_are_those_of_the_learned_field_unless_the_hull_overrules_it():
+def test_densities_are_those_of_the_learned_field_unless_the_share_of_the_hull_is_high():
     learned, hull = both(ball_views(ring(6, (24, 24))))
     points = torch.rand(50, 3) - 0.5
     for share, heavier in ((0.2, learned), (0.8, learned), (0.95, hull)):
@@ -174,25 +174,25 @@ def test_densities_are_those_of_the_learned_field_unless_the_hull_overrules_it()
     assert torch.equal(stack(learned, hull, 1.0).render(cameras).images, hull.render(cameras).images)
 
 
-def test_the_views_that_decide_are_not_shown(monkeypatch):
+def test_held_out_views_are_not_given_to_the_model(monkeypatch):
     adapter, support, shown = model(), ball_views(ring(7, (24, 24))), []
     prepare = adapter.prepare
     monkeypatch.setattr(adapter, "prepare", lambda views, **given: shown.append(views) or prepare(views, **given))
     assert 0 <= hull_share(hold_out(adapter, support)) <= 1
     (rest,) = shown
     assert len(rest) == 5
-    kept = sorted(outermost_first(support.camera_directions, 7)[:-2])  # without those that the others stand around
+    kept = sorted(outermost_first(support.camera_directions, 7)[:-2])  # without the innermost views
     torch.testing.assert_close(centres(rest.cameras), centres(support.cameras)[kept])
     apart = torch.cdist(centres(support.cameras), centres(rest.cameras)).amin(1)
     assert int((apart > 1e-3).sum()) == 2
 
 
-def test_where_nothing_was_learned_the_hull_is_shown():
+def test_if_the_learned_field_is_empty_the_hull_has_a_high_share():
     adapter, support, cameras = model(empty=True), ball_views(ring(8, (24, 24))), ring(3, (24, 24), shift=1)
     adapted = adapter.adapt(support)
     assert isinstance(adapted, StackedField)
     assert learned_part(adapted).share > 0.8
-    assert isinstance(adapted.other.field, Field)  # nothing is left of it, so densities are those of the hull
+    assert isinstance(adapted.other.field, Field)  # densities are those of the hull
     truth = ball_views(cameras).images
     alone = replace(adapter.config, stacked=False)
     without = HyperPlanes(alone)
@@ -202,8 +202,8 @@ def test_where_nothing_was_learned_the_hull_is_shown():
 
 
 @pytest.mark.parametrize("other", [1.0, 2.0, 7.0])
-def test_a_second_picture_is_made_only_where_it_is_worth_it(monkeypatch, other):
-    """Uncorrelated errors 1 and e: by a share s the squared error is (1 - s)^2 + s^2 e^2, least by 1 / (1 + e^2)."""
+def test_fields_are_stacked_only_if_the_error_decreases_enough(monkeypatch, other):
+    """Closed form: with errors 1 and e, the squared error (1 - s)^2 + s^2 e^2 is least for s = 1 / (1 + e^2)."""
     pixels = iter([torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.0, other, 0.0]])])
     support = ball_views(ring(6, (24, 24)))
     monkeypatch.setattr(held_out.HeldOutPixels, "errors", lambda *_: next(pixels))
@@ -214,8 +214,8 @@ def test_a_second_picture_is_made_only_where_it_is_worth_it(monkeypatch, other):
 
 
 @pytest.mark.parametrize("even", [-1.0, 0.02, EVEN, 1.0])
-def test_held_out_pixels_are_the_mean_of_three_rays_where_they_are_not_even(monkeypatch, even):
-    """Brute force: all three rays of every pixel."""
+def test_held_out_pixels_with_contrast_are_the_mean_of_three_rays(monkeypatch, even):
+    """Brute force: three rays for every pixel."""
     monkeypatch.setattr(held_out, "EVEN", even)
     adapter, support = model(), ball_views(ring(8, (24, 24)))
     order = outermost_first(support.camera_directions, len(support))
@@ -237,7 +237,7 @@ def test_held_out_pixels_are_the_mean_of_three_rays_where_they_are_not_even(monk
     assert (three - one).abs().max() > 0.01
 
 
-def test_few_views_or_none_with_masks_decide_nothing():
+def test_few_views_or_views_without_masks_give_no_share():
     adapter = model()
     for count in (1, FEWEST - 1):
         assert hull_share(hold_out(adapter, ball_views(ring(count, (24, 24))))) == 0
@@ -245,20 +245,20 @@ def test_few_views_or_none_with_masks_decide_nothing():
     assert hull_share(hold_out(model(empty=True), replace(support, masks=None))) == 0
     few = support.masks.clone()
     few[sorted(outermost_first(support.camera_directions, 6)[:-2])] = 0
-    assert hull_share(hold_out(model(empty=True), replace(support, masks=few))) == 0  # of which none is shown
+    assert hull_share(hold_out(model(empty=True), replace(support, masks=few))) == 0  # masks of given views are empty
     saved = HyperPlanes(replace(CONFIG, stacked=False, hull_share=0.5))
     assert not isinstance(saved.adapt(replace(support, masks=None)), StackedField)
     assert isinstance(saved.adapt(support), StackedField)
 
 
-def test_views_that_look_past_the_object_decide_nothing(monkeypatch):
+def test_held_out_views_without_the_object_give_no_share(monkeypatch):
     support = ball_views(ring(6, (24, 24)))
     assert hull_share(hold_out(model(empty=True), support)) > 0
     monkeypatch.setattr(held_out, "live_pixels", lambda *_: torch.arange(0))
     assert hull_share(hold_out(model(empty=True), support)) == 0
 
 
-def test_a_field_that_knows_views_by_their_places_is_not_stacked():
+def test_stacking_a_field_with_fixed_planes_is_refused():
     with pytest.raises(ValueError, match="stacked: .* got point_multiplane"):
         HyperPlanes(replace(ModelConfig(), stacked=True))
     with pytest.raises(ValueError, match="gated: .* got point_multiplane"):
@@ -276,7 +276,7 @@ def test_a_field_that_knows_views_by_their_places_is_not_stacked():
 
 @pytest.mark.parametrize("gated", [False, True])
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.8, 1.0])
-def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share, gated):
+def test_weights_of_one_object_reproduce_its_stacked_pictures(tmp_path, share, gated):
     adapter, support, cameras = model(), ball_views(ring(7, (24, 24))), ring(2, (10, 13), shift=1)
     gate = GatingNetwork() if gated else None
     stacked = stack(*both_of_reflected(), share, gate, views=14)
@@ -293,7 +293,7 @@ def test_the_weights_of_one_object_make_its_pictures_again(tmp_path, share, gate
     assert not fresh.gated
 
 
-def test_another_sampler_is_that_of_the_fields_before_and_after_gradient_steps():
+def test_another_sampler_applies_to_both_fields_of_an_average():
     learned, _ = both(ball_views(ring(5, (24, 24))))
     averaged, other, cameras = average(learned, learned, 0.5), Hierarchical(4, 4), ring(1, (12, 12), shift=1)
     expected = learned.render(cameras, other)
@@ -302,7 +302,7 @@ def test_another_sampler_is_that_of_the_fields_before_and_after_gradient_steps()
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9])
-def test_another_sampler_is_the_learned_fields_alone(share):
+def test_another_sampler_applies_only_to_the_learned_field_of_a_stack(share):
     learned, hull = both(ball_views(ring(5, (24, 24))))
     stacked = stack(learned, hull, share)
     assert stacked.overruled == (share == 0.9)
@@ -319,13 +319,13 @@ def test_another_sampler_is_the_learned_fields_alone(share):
     assert given.samples - learned.render(cameras, RayMarching(2, 0.0)).samples == of_hull
 
 
-def test_the_control_of_another_objects_update_is_stacked_as_the_object_is(monkeypatch):
+def test_a_field_with_a_swapped_update_is_stacked_with_the_same_share(monkeypatch):
     adapter, supports = model(), [ball_views(ring(6, (24, 24)), radius=radius) for radius in (0.4, 0.7)]
     swapped, cameras = Swapped(adapter, supports), ring(1, (24, 24), shift=1)
     for share in (0.0, 0.5, 1.0):
         monkeypatch.setattr(stacking, "hull_share", lambda *_, share=share: share)
         own, other = (each.adapt(supports[0]).render(cameras).images for each in (adapter, swapped))
-        assert torch.equal(own, other) == (share == 1.0)  # the hull alone
+        assert torch.equal(own, other) == (share == 1.0)  # only the hull
 
 
 def test_the_swap_gap_of_a_validation_compares_fields_that_are_not_stacked(monkeypatch):
@@ -340,7 +340,7 @@ def test_the_swap_gap_of_a_validation_compares_fields_that_are_not_stacked(monke
     assert stacked.diagnostics.swap_gap == alone.diagnostics.swap_gap
 
 
-def test_auto_compares_steps_with_the_field_that_they_begin_at(monkeypatch):
+def test_auto_compares_steps_with_the_adapted_field(monkeypatch):
     seen, adapter, support = [], model(), ball_views(ring(12, (16, 16)))
 
     def best_stop(self, holdout, *, unchanged, **given):
@@ -355,4 +355,4 @@ def test_auto_compares_steps_with_the_field_that_they_begin_at(monkeypatch):
     ((unchanged, begun),) = seen
     cameras = split_holdout(support, FineTuning())[1].cameras
     torch.testing.assert_close(adapter.adapt(shown[0]).render(cameras).images, unchanged, atol=1e-4, rtol=0)
-    assert (begun - unchanged).abs().max() > 0.01  # half of the weights that steps begin with are random
+    assert (begun - unchanged).abs().max() > 0.01  # the initial weights of the steps are half random

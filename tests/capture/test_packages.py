@@ -1,4 +1,4 @@
-"""Source of truth: packages that raise on import what they are told to."""
+"""Source of truth: fake packages that raise known errors on import."""
 
 import pytest
 
@@ -13,7 +13,7 @@ except {raised}:
     except ImportError as error:
         raise RuntimeError("Cannot import\\nthe backend") from error
 """
-"""As pybind11 and pycolmap pass on what their import raises."""
+"""pybind11 and pycolmap raise errors of their import in this way."""
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,7 @@ def test_a_package_that_cannot_be_imported_is_named_in_one_line(code, found, tmp
     assert str(raised.value).endswith(f"found {found}; pip install 'hyperplanes[photos]'")
 
 
-def test_an_interrupt_of_an_import_stays_one(tmp_path, monkeypatch):
+def test_a_keyboard_interrupt_during_an_import_is_raised(tmp_path, monkeypatch):
     (tmp_path / "interrupted_package.py").write_text(WRAPPED.format(raised="KeyboardInterrupt"))
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(KeyboardInterrupt):
@@ -40,6 +40,6 @@ def test_an_interrupt_of_an_import_stays_one(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("stated", "threads"), [("4", 4), ("4,2", 4), ("", 0), ("many", 0)])
-def test_threads_are_those_of_the_environment(stated, threads, monkeypatch):
+def test_the_number_of_threads_comes_from_the_environment(stated, threads, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", stated)
     assert stated_threads() == threads

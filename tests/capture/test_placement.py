@@ -1,4 +1,4 @@
-"""Source of truth: worlds whose up and whose object are known, seen by cameras that are held in known ways."""
+"""Source of truth: worlds with a known up direction and object, seen by cameras with known orientations."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def world_from_y_up():
 
 
 def scene(elevation=0.6, views=12, seed=0, plane=False):
-    """A ball of radius 0.5 around (3, 1, 2) among points far away, in a world whose up is UP; and its masks."""
+    """A model of a ball of radius 0.5 around (3, 1, 2) and of far points, in a world with up UP; masks; the centre."""
     generator = np.random.default_rng(seed)
     turn, middle = world_from_y_up(), np.array([3.0, 1.0, 2.0])
     pose = camera.orbit(views, 3.0, elevation).numpy().astype(float)
@@ -65,7 +65,7 @@ def degrees(found, true=UP):
     return float(np.rad2deg(np.arccos(np.clip(found @ true, -1, 1))))
 
 
-def test_the_sphere_holds_the_points_within_the_masks():
+def test_the_sphere_contains_the_points_within_the_masks():
     model, masks, middle = scene()
     chosen = object_points(model, masks)
     assert chosen[:400].mean() > 0.95
@@ -84,10 +84,10 @@ def test_up_is_perpendicular_to_level_horizons():
     assert source == "the cameras' horizon"
 
 
-def test_up_holds_where_some_cameras_are_turned_on_their_side():
+def test_up_is_found_if_some_cameras_are_in_portrait_orientation():
     model, masks, _ = scene()
     ups = np.tile([0.0, -1.0, 0.0], (len(model), 1))
-    quarter = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # counterclockwise in the picture
+    quarter = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # counterclockwise in the image
     model.camera_from_world[::3] = quarter @ model.camera_from_world[::3]
     ups[::3] = [-1.0, 0.0, 0.0]
     chosen = np.zeros(len(model.points), bool)
@@ -95,7 +95,7 @@ def test_up_holds_where_some_cameras_are_turned_on_their_side():
     assert degrees(find_up(model, ups, object_sphere(model, chosen), chosen)[0]) < 0.1
 
 
-def test_a_plane_under_the_object_decides_where_the_cameras_are_held_badly():
+def test_a_plane_under_the_object_determines_up_if_the_cameras_are_rolled():
     model, masks, _ = scene(plane=True)
     generator = np.random.default_rng(1)
     for view in range(len(model)):
@@ -118,7 +118,7 @@ def test_a_placed_world_has_z_up_and_the_object_in_the_unit_sphere():
     rotations = torch.from_numpy(moved.camera_from_world[:, :3, :3])
     identity = torch.eye(3, dtype=torch.float64).expand_as(rotations)
     torch.testing.assert_close(rotations @ rotations.mT, identity, rtol=0, atol=1e-6)  # poses in single precision
-    for view in range(len(model)):  # a similarity of points and cameras changes no picture
+    for view in range(len(model)):  # a similarity transform of points and cameras changes no projection
         (before, z), (after, _) = model.project(view, model.points), moved.project(view, moved.points)
         np.testing.assert_allclose(after[:, z > 0], before[:, z > 0], rtol=1e-5, atol=1e-4)
     right = moved.camera_from_world[:, 0, :3]
@@ -126,7 +126,7 @@ def test_a_placed_world_has_z_up_and_the_object_in_the_unit_sphere():
 
 
 @pytest.mark.parametrize("views", [3])
-def test_without_masks_the_object_is_what_the_cameras_look_at(views):
+def test_without_masks_the_object_is_at_the_point_that_the_cameras_look_at(views):
     model, _, middle = scene(views=views)
     sphere = object_sphere(model, object_points(model, None))
     assert np.linalg.norm(np.array(sphere.centre) - middle) < 0.2

@@ -1,4 +1,4 @@
-"""Source of truth: pictures whose pixels are known before they were turned, scaled and saved."""
+"""Source of truth: the pixels of images before they were rotated, scaled and saved."""
 
 import re
 import sys
@@ -19,14 +19,14 @@ ORIENTATION, MODEL, EXIF, FOCAL_35 = 0x0112, 0x0110, 0x8769, 0xA405
 
 @pytest.fixture
 def upright():
-    """A picture of 40 x 24 pixels whose upper half is red and whose left half is bright."""
+    """An image of 40 x 24 pixels that is red in its upper half and green in its left half."""
     picture = np.zeros((24, 40, 3), np.uint8)
     picture[:12, :, 0], picture[:, :20, 1] = 200, 100
     return picture
 
 
 def save(picture, path, orientation=1, **tags):
-    """A photograph whose sensor was held so that EXIF's orientation shows it upright."""
+    """Save an image rotated, with the EXIF orientation that rotates it back upright."""
     turns = {1: 0, 8: 3, 3: 2, 6: 1}  # quarter turns counterclockwise from upright to stored
     exif = Image.Exif()
     exif[ORIENTATION] = orientation
@@ -46,14 +46,14 @@ def test_photographs_are_read_upright(upright, tmp_path, orientation):
     np.testing.assert_array_equal(picture, upright)
 
 
-def test_photographs_of_one_name_get_names_that_no_other_has(upright, tmp_path):
+def test_photographs_with_equal_stems_get_unique_names(upright, tmp_path):
     for name in ("a.jpg", "a.png", "a_2.jpg"):
         save(upright, tmp_path / name)
     photographs, _ = list_photographs(find_photographs(tmp_path))
     assert len({each.name for each in photographs}) == 3
 
 
-def test_the_rarer_shape_lies_on_its_side_and_knows_where_up_is(upright, tmp_path):
+def test_photographs_of_the_rarer_shape_are_rotated_and_know_their_up_direction(upright, tmp_path):
     for index in range(3):
         save(upright, tmp_path / f"{index}.png")
     tall = np.ascontiguousarray(upright.transpose(1, 0, 2))
@@ -67,7 +67,7 @@ def test_the_rarer_shape_lies_on_its_side_and_knows_where_up_is(upright, tmp_pat
     assert towards[1] < 0  # green is the upper half of the tall picture
 
 
-def test_numbers_in_names_count(upright, tmp_path):
+def test_names_are_sorted_by_their_numbers(upright, tmp_path):
     for name in ("IMG_10.png", "IMG_9.png", "IMG_100.png", "IMG_9²3.png"):
         save(upright, tmp_path / name)
     assert [path.stem for path in find_photographs(tmp_path)] == ["IMG_9", "IMG_9²3", "IMG_10", "IMG_100"]
@@ -77,11 +77,11 @@ def test_the_focal_length_comes_from_exif(upright, tmp_path):
     for index in range(3):
         save(upright, tmp_path / f"{index}.jpg", focal=27)
     (first, *_), _ = list_photographs(find_photographs(tmp_path))
-    assert first.focal == pytest.approx(0.75)  # 27 mm before a film of 36 mm
+    assert first.focal == pytest.approx(0.75)  # 27 mm with a film width of 36 mm
 
 
 @pytest.mark.parametrize("drawn", ["as stored", "upright"])
-def test_masks_beside_turned_photographs_are_turned_with_them(upright, tmp_path, drawn):
+def test_masks_of_rotated_photographs_are_rotated_with_them(upright, tmp_path, drawn):
     (tmp_path / "masks").mkdir()
     mask = np.zeros((24, 40), np.uint8)
     mask[:12] = 255
@@ -94,7 +94,7 @@ def test_masks_beside_turned_photographs_are_turned_with_them(upright, tmp_path,
 
 
 @pytest.mark.parametrize("kind", ["masks/", "alpha"])
-def test_masks_do_not_change_the_pictures_that_poses_are_found_in(kind, tmp_path, monkeypatch):
+def test_masks_do_not_change_the_images_for_pose_estimation(kind, tmp_path, monkeypatch):
     shown = []
 
     def find_poses(pictures, folder, *_, **__):
@@ -117,7 +117,7 @@ def test_masks_do_not_change_the_pictures_that_poses_are_found_in(kind, tmp_path
     assert shown[0] == shown[attempts]
 
 
-def test_an_empty_folder_of_masks_is_none(upright, tmp_path):
+def test_an_empty_folder_of_masks_is_ignored(upright, tmp_path):
     for index in range(3):
         save(upright, tmp_path / f"{index}.jpg")
     (tmp_path / "masks").mkdir()
@@ -125,7 +125,7 @@ def test_an_empty_folder_of_masks_is_none(upright, tmp_path):
     assert ([photograph.mask for photograph in photographs], notes) == ([None] * 3, [])
 
 
-def test_masks_of_close_ups_may_be_white_all_over(upright, tmp_path):
+def test_masks_may_be_entirely_white(upright, tmp_path):
     (tmp_path / "masks").mkdir()
     for index in range(3):
         save(upright, tmp_path / f"{index}.png")
@@ -135,7 +135,7 @@ def test_masks_of_close_ups_may_be_white_all_over(upright, tmp_path):
     assert len(opacities) == 3
 
 
-def test_alpha_that_is_opaque_throughout_is_no_mask_and_that_of_one_among_others_is(upright, tmp_path):
+def test_opaque_alpha_is_a_mask_only_if_another_image_has_transparency(upright, tmp_path):
     rgba = np.dstack([upright, np.full((24, 40), 255, np.uint8)])
     for transparent in (0, 1):
         for index in range(3):
@@ -154,7 +154,7 @@ def test_too_few_photographs_are_refused(upright, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "advice"), [("day/1.png", "some in {}/day: give"), ("walk.mp4", "give {}/walk.mp4")])
-def test_what_may_have_been_meant_by_a_folder_without_photographs_is_named(name, advice, upright, tmp_path):
+def test_the_error_for_a_folder_without_photographs_suggests_another_path(name, advice, upright, tmp_path):
     if name.endswith(".png"):
         (tmp_path / "day").mkdir()
         save(upright, tmp_path / name)
@@ -192,7 +192,7 @@ def test_copies_of_a_file_are_left_out(upright, tmp_path):
         ("grabcut", "package cv2"),
     ],
 )
-def test_masks_that_nothing_finds_are_refused_before_poses_are_searched_for(mask, said, tmp_path, monkeypatch):
+def test_unusable_mask_methods_are_refused_before_poses_are_estimated(mask, said, tmp_path, monkeypatch):
     monkeypatch.setattr(network, "weights", lambda: None)
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(ValueError, match=said):
@@ -207,9 +207,7 @@ def test_masks_that_nothing_finds_are_refused_before_poses_are_searched_for(mask
         ("auto", "object_0.png", "masks: expected masks named as the images, found none for 0.png"),
     ],
 )
-def test_masks_that_are_missing_are_asked_for_before_poses_are_searched_for(
-    mask, name, said, upright, tmp_path, monkeypatch
-):
+def test_missing_masks_are_reported_before_poses_are_estimated(mask, name, said, upright, tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: pytest.fail("poses are searched for"))
     for index in range(3):
         save(np.roll(upright, index, 0), tmp_path / f"{index}.png")
@@ -221,7 +219,7 @@ def test_masks_that_are_missing_are_asked_for_before_poses_are_searched_for(
 
 
 @pytest.mark.parametrize(("given", "out"), [("scene", "scene"), ("scene/images", "scene"), ("capture/pictures", ".")])
-def test_a_scene_is_not_written_over_the_photographs_that_it_is_made_of(given, out, upright, tmp_path):
+def test_a_scene_does_not_overwrite_its_photographs(given, out, upright, tmp_path):
     for index in range(3):
         (tmp_path / given).mkdir(parents=True, exist_ok=True)
         save(upright if index else upright[::-1], tmp_path / given / f"{index}.png")
@@ -231,7 +229,7 @@ def test_a_scene_is_not_written_over_the_photographs_that_it_is_made_of(given, o
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
-def test_what_lies_beside_the_pictures_of_a_former_scene_stays(tmp_path):
+def test_other_files_in_the_folders_of_a_scene_are_kept(tmp_path):
     model = Published([np.zeros((10, 12, 4), np.uint8)] * 4, np.stack([np.eye(4)] * 4)).sparse_model()
     names, size = ["0", "1", "2", "3"], [(10, 12)] * 4
     first = {f"{kind}/{name}.{end}": b"1" for kind, end in (("images", "jpg"), ("masks", "png")) for name in names}
@@ -247,6 +245,6 @@ def test_what_lies_beside_the_pictures_of_a_former_scene_stays(tmp_path):
 
 
 @pytest.mark.parametrize("wrong", [{"order": "sequnce"}, {"max_size": 0}, {"frames": 2}])
-def test_settings_that_cannot_be_are_refused(wrong):
+def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected"):
         Settings(**wrong)

@@ -1,4 +1,4 @@
-"""Source of truth: what was begun, interrupted and finished."""
+"""Source of truth: stages that are started, interrupted and finished here."""
 
 from hyperplanes.capture.stages import Stages, fingerprint
 
@@ -11,7 +11,7 @@ def test_a_finished_stage_is_not_done_again(tmp_path):
     assert Stages(tmp_path).begin("masks", "a") == {"count": 1}
 
 
-def test_an_interrupted_stage_keeps_its_files_and_another_one_does_not(tmp_path):
+def test_an_interrupted_stage_keeps_its_files_unless_its_key_changes(tmp_path):
     stages = Stages(tmp_path)
     stages.begin("masks", "a")
     (tmp_path / "masks" / "0.png").write_bytes(b"0")
@@ -22,6 +22,6 @@ def test_an_interrupted_stage_keeps_its_files_and_another_one_does_not(tmp_path)
     assert stages.key("masks") == "b"
 
 
-def test_a_fingerprint_tells_inputs_apart():
+def test_fingerprints_of_different_inputs_differ():
     assert fingerprint("a", 1) == fingerprint("a", 1)
     assert fingerprint("a", 1) != fingerprint("a", 2)

@@ -1,4 +1,4 @@
-"""Source of truth: the settings that a printed command is parsed to."""
+"""Source of truth: the settings that are parsed from a printed command."""
 
 import shlex
 from dataclasses import replace
@@ -20,7 +20,7 @@ from hyperplanes.experiments.demonstration.settings import DemoSettings
         replace(DemoSettings.quick_check(3), class_name="lamp", meshes=Path("tests/my meshes")),
     ],
 )
-def test_the_command_of_a_demonstration_makes_the_same_again(settings, tmp_path):
+def test_the_printed_command_gives_the_same_settings(settings, tmp_path):
     settings = settings if settings.meshes is None else replace(settings, meshes=tmp_path)
     command = shlex.split(settings.command(Path("my runs/demo")))
     assert command[:2] == ["hyperplanes", "demo"]

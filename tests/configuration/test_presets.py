@@ -1,4 +1,4 @@
-"""Source of truth: Appendix B of the paper, written out here as numbers."""
+"""Source of truth: the numbers of Appendix B of the paper."""
 
 from dataclasses import replace
 
@@ -18,14 +18,14 @@ from tests.reference_rendering import Balls, ring
 
 
 def shapes(name):
-    """A preset's model without memory for its weights."""
+    """The model of a preset on the meta device, without memory for its weights."""
     with torch.device("meta"):
         return HyperPlanes(preset(name).model)
 
 
 @pytest.mark.parametrize("name", ["paper-128", "paper-200"])
-def test_the_papers_target_network(name):
-    # Appendix B: 8 layers of 256, 25 ImagePlanes; five numbers a plane and 3 (1 + 2 * 10) of the encoded point
+def test_the_target_network_of_the_paper(name):
+    # Appendix B: 8 layers of 256, 25 ImagePlanes; inputs are 5 per plane and 3 (1 + 2 * 10) of the encoded point
     model = shapes(name)
     for network in model.networks.values():
         assert [layer.out_features for layer in network.layers] == [256] * 8
@@ -43,7 +43,7 @@ def test_a_preset_fits_every_method_that_has_no_hypernetwork(name, method):
 
 
 @pytest.mark.parametrize(("name", "depth", "views"), [("paper-128", 3, 5), ("paper-200", 10, 25)])
-def test_the_papers_hypernetwork(name, depth, views):
+def test_the_hypernetwork_of_the_paper(name, depth, views):
     hypernetwork = shapes(name).hypernetwork
     assert [layer.out_features for layer in hypernetwork.head] == [256] * depth
     assert hypernetwork.config.views == views
@@ -53,7 +53,7 @@ def test_the_papers_hypernetwork(name, depth, views):
     assert sorted(layer.out_features for layer in hypernetwork.outputs) == sorted([384, 3, 256, 1] * 2)
 
 
-def test_the_papers_encoders():
+def test_the_encoders_of_the_paper():
     small, large = (shapes(name).hypernetwork.encoder for name in ("paper-128", "paper-200"))
     assert isinstance(small, ConvNet)
     assert any(isinstance(layer, nn.BatchNorm2d) for layer in small.modules())
@@ -62,7 +62,7 @@ def test_the_papers_encoders():
 
 
 @pytest.mark.parametrize("name", ["paper-128", "paper-200"])
-def test_the_papers_protocol_and_training(name):
+def test_the_protocol_and_the_training_of_the_paper(name):
     chosen = preset(name)
     assert chosen.model.sampling == Hierarchical(64, 128)  # Appendix B: samples 64, importance 128
     assert chosen.model.coarse_network
@@ -87,7 +87,7 @@ def test_every_preset_survives_json_and_fits_its_own_parts(name):
 
 @pytest.mark.parametrize("name", ["paper-128", "quick"])
 def test_a_preset_trains_and_renders_at_toy_resolution(name):
-    """The architecture as it is; 25 pictures of 12 x 12 and few rays and samples."""
+    """With the whole architecture, but 25 images of 12 x 12 pixels and few rays and samples."""
     chosen = preset(name)
     sampling = Hierarchical(4, 4) if isinstance(chosen.model.sampling, Hierarchical) else chosen.model.sampling
     torch.manual_seed(0)
@@ -99,25 +99,25 @@ def test_a_preset_trains_and_renders_at_toy_resolution(name):
     moved = {
         key.split(".")[0] + "." + key.split(".")[1] for key, v in model.named_parameters() if (v != before[key]).any()
     }
-    # outputs move once there are two objects to compare, and the encoder behind them a step later
+    # the outputs change once there are two objects to compare, and the encoder one step later
     assert {f"networks.{part}" for part in model.networks} | {"hypernetwork.outputs"} <= moved
     pictures = model.adapt(data.task("train0").support).render(ring(1, (6, 6)))
     assert torch.isfinite(pictures.images).all()
     assert ((pictures.images >= 0) & (pictures.images <= 1.0001)).all()
 
 
-def test_the_fast_protocol_leaves_a_fast_preset_as_it_is():
+def test_ray_marching_does_not_change_a_preset_with_ray_marching():
     for name in ("quick", "small", "paper-128-brief"):
         assert preset(name).by_protocol("ray_marching") == preset(name)
     assert isinstance(
         preset("paper-128-brief").model.sampling, RayMarching
-    )  # what the benchmarks' weights were trained by
+    )  # the weights of the benchmarks were trained with it
 
 
 @pytest.mark.parametrize("method", ["image_based", "mv_meta", "maml"])
-def test_what_a_hypernetwork_learns_is_not_asked_of_a_method_without_one(method):
+def test_methods_without_a_hypernetwork_drop_its_training_settings(method):
     made = preset("small").by_method(method, None if method == "image_based" else "image_based")
-    Trainer(HyperPlanes(made.model), Balls(), replace(made.training, held_out=0))  # is refused otherwise
+    Trainer(HyperPlanes(made.model), Balls(), replace(made.training, held_out=0))  # raises otherwise
 
 
 def test_an_unknown_preset_is_refused():
@@ -127,14 +127,14 @@ def test_an_unknown_preset_is_refused():
 
 @pytest.mark.parametrize("first", ["mv_meta", "maml", "autoencoder", "hyperplanes"])
 @pytest.mark.parametrize("second", ["nerf", "point_multiplane", "autoencoder", "mv_meta", "image_based"])
-def test_another_method_leaves_nothing_of_the_first_one(first, second):
+def test_choosing_another_method_removes_the_settings_of_the_first(first, second):
     made = preset("quick").by_method(first).by_method(second)
     assert made.model.method == preset("quick").by_method(second).model.method
     check_model(made.model)
     check_training(made.training, made.model)
 
 
-def test_a_field_that_knows_planes_by_their_places_has_nothing_of_one_that_takes_any_views():
+def test_a_field_with_fixed_planes_drops_settings_of_fields_for_any_views():
     small = preset("small")
     model = replace(
         small.model, gated=True, stacked=False, hull_share=0.2, azimuth=0.3, symmetry=Symmetry(Plane((1.0, 0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""Small scenes on disk, written by hand: no renderer and no generator takes part."""
+"""Small scenes on disk that are written by hand, without the renderer or the generator."""
 
 import json
 import math
@@ -12,7 +12,7 @@ from hyperplanes.geometry import cameras as camera
 
 
 class Scene:
-    """A red ball of radius 0.5 around (0.1, 0.2, 0), seen from all sides; ray-sphere intersection draws it."""
+    """Pictures of a red ball of radius 0.5 at (0.1, 0.2, 0) from all sides, drawn by ray-sphere intersection."""
 
     centre = np.array([0.1, 0.2, 0.0])
     radius = 0.5
@@ -60,7 +60,7 @@ class Scene:
 
 @pytest.fixture(autouse=True, scope="package")
 def one_thread():
-    """Scenes this small are read faster by one thread, and on a busy machine ten times faster."""
+    """One thread reads such small scenes faster than several, on a busy machine ten times."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

@@ -1,7 +1,7 @@
-"""Polycam, Record3D, RealityCapture, Metashape, KIRI Engine: each written here as it is published.
+"""Exports of Polycam, Record3D, RealityCapture, Metashape and KIRI Engine, written here as they are published.
 
-Source of truth: pixels of known points by hand, as in test_formats, and for lenses the formulas of the programs' own
-manuals, by which a dot is drawn where the lens shows a known point: read, it is where the pinhole shows that point.
+Source of truth: pixels of known points by hand, as in test_formats. For lenses: a dot is drawn at the distorted pixel
+of a known point, by the formulas of the programs' manuals; after reading, it is at the pixel without distortion.
 Layouts: nerfstudio's process_data, the author of Record3D in its issues 27, 33 and 83, Metashape's manual ("Camera
 models"), "RealityCapture XMP Camera Math".
 """
@@ -21,7 +21,7 @@ from hyperplanes.data.formats.apps.calibration import brown_lens
 from hyperplanes.data.formats.apps.realitycapture import world_from_angles
 from hyperplanes.data.pictures.undistort import distort
 
-CENTRE = (14.0, 9.0)  # at integer pixel centres; half a pixel more from the corner
+CENTRE = (14.0, 9.0)  # pixel centres at integers; add 0.5 from the corner
 NAMES = [f"IMG_{index}.JPG" for index in range(VIEWS)]
 
 
@@ -91,7 +91,7 @@ def metashape(folder, lens="", component=True, size=(WIDTH, HEIGHT), focal=FOCAL
 
 
 def test_polycam(tmp_path):
-    """Corrected cameras go before those of the moment, which here lie elsewhere; ARKit's world has y up."""
+    """Corrected cameras are preferred to the original ones, which are wrong here. ARKit's world has y up."""
     polycam(tmp_path)
     views = read_views(tmp_path)
     np.testing.assert_allclose(found(views), expected(CENTRE), atol=1e-3)
@@ -152,7 +152,7 @@ def test_realitycapture(tmp_path, head):
 
 
 def test_the_angles_of_realitycapture():
-    """Both exports of one camera by RealityCapture: CSV and XMP, from a question in Epic's forum (710449)."""
+    """The CSV and XMP exports of one camera by RealityCapture, from a question in Epic's forum (710449)."""
     rotation = world_from_angles(163.736597399311, 83.4154313461628, 174.386496244756)
     xmp = [
         [0.982594073038806, 0.185426733553445, -0.0112166890261935],
@@ -164,7 +164,7 @@ def test_the_angles_of_realitycapture():
 
 @pytest.mark.parametrize("component", [True, False])
 def test_metashape(tmp_path, component):
-    """Turned, moved and scaled as the component says, or the chunk where that says nothing; paths of Windows."""
+    """The transform is that of the component, or else that of the chunk. Paths are those of Windows."""
     more = (
         '<camera id="8" sensor_id="0" component_id="0" label="lost.JPG"/>'
         '<camera id="9" sensor_id="0" component_id="0" enabled="false" label="off"><transform>1</transform></camera>'
@@ -200,7 +200,7 @@ def test_metashape(tmp_path, component):
         (metashape, "photos"),
     ],
 )
-def test_names_lead_to_the_photographs_which_nothing_is_written_beside(tmp_path, write, home):
+def test_names_refer_to_the_photographs_and_no_output_is_written_to_their_folder(tmp_path, write, home):
     if write in (realitycapture, metashape):
         pictures(tmp_path / home, NAMES)
     write(tmp_path)
@@ -211,7 +211,7 @@ def test_names_lead_to_the_photographs_which_nothing_is_written_beside(tmp_path,
     refuse_sources(tmp_path / "made", tmp_path, task)
 
 
-def test_a_label_without_ending_is_that_of_one_photograph(tmp_path):
+def test_a_label_without_a_suffix_needs_a_single_photograph(tmp_path):
     pictures(tmp_path / "photos", NAMES)
     metashape(tmp_path, component=False)
     assert read_views(tmp_path).names[1] == "photos/IMG_1.JPG"
@@ -224,7 +224,7 @@ LENS = {"k1": -0.35, "k2": 0.3, "k3": -0.2, "k4": 0.15, "p1": 0.02, "p2": -0.03}
 
 
 def seen(x, y, k1, k2, k3, k4, p1, p2):
-    """Metashape's manual: where its lens shows a direction (x, y)."""
+    """The distorted coordinates of a direction (x, y), by Metashape's manual."""
     r = x * x + y * y
     radial = 1 + k1 * r + k2 * r**2 + k3 * r**3 + k4 * r**4
     across = p1 * (r + 2 * x * x) + 2 * p2 * x * y, p2 * (r + 2 * y * y) + 2 * p1 * x * y
@@ -235,7 +235,7 @@ def seen(x, y, k1, k2, k3, k4, p1, p2):
 def test_lenses(tmp_path, program):
     """RealityCapture's t1 and t2 are Metashape's p2 and p1."""
     size, focal = (90, 54), 60.0
-    ideal = (expected(CENTRE)[:, 0] - CENTRE) / FOCAL + [0.35, 0.3]  # a dot off the middle, in each picture another
+    ideal = (expected(CENTRE)[:, 0] - CENTRE) / FOCAL + [0.35, 0.3]  # dots away from the centre
     shown = seen(*ideal.T, **LENS) * focal + CENTRE
     rows, columns = np.mgrid[: size[1], : size[0]]
     for name, (x, y) in zip(NAMES, shown, strict=True):
@@ -254,7 +254,7 @@ def test_lenses(tmp_path, program):
 
 
 def test_a_lens_with_four_radial_coefficients():
-    """OpenCV's quotient of polynomials against the polynomial, up to the corner: a hundredth of a pixel at 1,000."""
+    """OpenCV's quotient of polynomials is equal to the polynomial to 1e-5, or 0.01 pixels at a focal length of 1000."""
     radii = np.stack([np.linspace(0, 0.9, 50), np.zeros(50)], -1)
     lens = brown_lens([-0.09, -0.08, 0.12, -0.076], [0.0, 0.0], 0.9, "")
     wanted = seen(*radii.T, -0.09, -0.08, 0.12, -0.076, 0.0, 0.0)
@@ -264,7 +264,7 @@ def test_a_lens_with_four_radial_coefficients():
 
 
 def test_kiri_engine(tmp_path):
-    """It exports nerfstudio's layout (nerfstudio's documentation, "KIRI Engine Capture"): transforms.json, images/."""
+    """It exports transforms.json and images/ as nerfstudio does (its documentation, "KIRI Engine Capture")."""
     pictures(tmp_path / "images", NAMES)
     frames = [
         {"file_path": f"./images/{name}", "transform_matrix": pose.tolist()}
@@ -276,7 +276,7 @@ def test_kiri_engine(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "inner"), [("scan.zip", "scan.zip"), ("video.r3d", "."), ("a.zip", "a.zip")])
-def test_packed_exports_are_told_to_be_unpacked(tmp_path, name, inner):
+def test_for_packed_exports_the_error_says_to_unpack_them(tmp_path, name, inner):
     (tmp_path / name).write_bytes(b"PK")
     with pytest.raises(DataError, match=rf"expected the folder of an export, found {name}, .*; unpack it \(unzip"):
         read_task(tmp_path / inner)

@@ -1,4 +1,4 @@
-"""Source of truth: the same points in another order, and balls around a few points."""
+"""Source of truth: the same points in another order, and bounding balls of a few points."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def test_the_ball_around_voxels_does_not_depend_on_their_order():
     [
         ([[1.0, 2.0, 3.0]], 0.0),
         ([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], 1.0),
-        ([[0.0, 0.0, 0.0], [0.0, 0.0, 4.0], [0.0, 0.0, 1.0]], 2.0),  # the one in the middle does not come between
+        ([[0.0, 0.0, 0.0], [0.0, 0.0, 4.0], [0.0, 0.0, 1.0]], 2.0),  # the point between the others changes nothing
     ],
 )
 def test_the_ball_around_few_points(points, radius):

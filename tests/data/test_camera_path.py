@@ -1,4 +1,4 @@
-"""Source of truth: nerfstudio's conventions, written out by hand: OpenGL axes, fov of the height, scale (R p + t)."""
+"""Source of truth: nerfstudio's conventions by hand: OpenGL axes, vertical fov, world coordinates scale (R p + t)."""
 
 import json
 import math
@@ -26,12 +26,12 @@ def written(path, content):
 
 
 def poses(count=3):
-    """OpenGL camera-to-world of cameras around the origin."""
+    """Matrices world_from_camera (view, 4, 4) of cameras around the origin, with OpenGL axes."""
     return camera.opengl_from_opencv(camera.fibonacci_sphere(count, 3.0).double()).numpy()
 
 
-def test_frames_are_cameras_with_the_angle_of_the_height(tmp_path):
-    """A fov of 90 degrees sees as far up as it is away: the picture's upper border, half a pixel above row 0."""
+def test_frames_are_cameras_with_a_vertical_field_of_view(tmp_path):
+    """With a fov of 90 degrees, a point as high as it is distant is at the upper border, half a pixel above row 0."""
     level = np.eye(4)
     level[:3, 3] = 0, 0, 2  # looks along -z at the origin, from +2
     found = read_camera_path(written(tmp_path / "a.json", document([level])))
@@ -43,8 +43,8 @@ def test_frames_are_cameras_with_the_angle_of_the_height(tmp_path):
     torch.testing.assert_close(several.cameras.extrinsics, camera.fibonacci_sphere(3, 3.0), atol=1e-5, rtol=0)
 
 
-def test_what_nerfstudio_did_to_the_world_is_undone(tmp_path):
-    """Its world is scale (R p + t); where transforms.json applied a transform, R and t are of the world before."""
+def test_nerfstudios_transform_of_the_world_is_inverted(tmp_path):
+    """Its world is scale (R p + t). If transforms.json has `applied_transform`, R and t are of the world before it."""
     scale, ours = 0.4, poses()
     theirs = TURNED @ ours
     theirs[:, :, 3] *= scale
@@ -53,14 +53,14 @@ def test_what_nerfstudio_did_to_the_world_is_undone(tmp_path):
     stated = written(tmp_path / "dataparser_transforms.json", {"transform": TURNED.tolist(), "scale": scale})
     found = read_camera_path(path, stated).cameras
     torch.testing.assert_close(found.extrinsics, camera.fibonacci_sphere(3, 3.0), atol=1e-5, rtol=0)
-    # of data whose files hold A p: nerfstudio writes R A, t, and the factor times that of the files
+    # for files with A p, nerfstudio writes R A, t, and its factor times that of the files
     applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
     whole = np.vstack([TURNED, [0, 0, 0, 1]]) @ np.vstack([applied, [0, 0, 0, 1]])
     stated = written(tmp_path / "b.json", {"transform": whole[:3].tolist(), "scale": 2 * scale})
     scene = {"applied_transform": applied.tolist(), "applied_scale": 2.0}
     found = read_camera_path(path, stated, scene).cameras
     torch.testing.assert_close(found.extrinsics, camera.fibonacci_sphere(3, 3.0), atol=1e-5, rtol=0)
-    # of data whose files state a factor alone: R, t, and the factor times that of the files
+    # for files with only a factor, it writes R, t, and its factor times that of the files
     stated = written(tmp_path / "c.json", {"transform": TURNED.tolist(), "scale": 2 * scale})
     found = read_camera_path(path, stated, {"applied_scale": 2.0}).cameras
     torch.testing.assert_close(found.extrinsics, camera.fibonacci_sphere(3, 3.0), atol=1e-5, rtol=0)
@@ -87,12 +87,12 @@ def test_what_nerfstudio_did_to_the_world_is_undone(tmp_path):
         ({"seconds": "2"}, "expected a time above 0 as seconds, found '2'"),
     ],
 )
-def test_what_is_no_path_is_refused(tmp_path, change, message):
+def test_an_invalid_path_is_refused(tmp_path, change, message):
     with pytest.raises(DataError, match=message):
         read_camera_path(written(tmp_path / "a.json", document(poses(1), **change)))
 
 
-def test_what_is_left_out_is_said(tmp_path):
+def test_ignored_fields_are_reported(tmp_path):
     path = written(tmp_path / "a.json", document(poses(1), crop={"crop_scale": [1, 1, 1]}))
     assert read_camera_path(path).notes == ("its crop is left out",)
     path = written(tmp_path / "b.json", document(poses(1), crop=None, render_time=None))

@@ -1,4 +1,4 @@
-"""Source of truth: scenes whose poses are right by construction, and the same ones made wrong in a known way."""
+"""Source of truth: scenes with correct poses by construction, and the same scenes with known errors."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ SIZE, RADIUS = 96, 0.8
 
 
 def photographs(count, start=0.0):
-    """A textured ball before a textured room, without masks; cameras a few degrees apart. Each pixel in closed form."""
+    """A textured ball in a textured sphere, without masks, from cameras a few degrees apart; in closed form."""
     angle = start + torch.arange(count) * 0.12
     eyes = 3 * torch.stack([angle.sin(), 0.25 * (angle * 5).sin(), angle.cos()], -1)
     cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), camera.look_at(eyes), SIZE, SIZE)
@@ -43,7 +43,7 @@ def photographs(count, start=0.0):
 
 
 def moved(views, matrix):
-    """The pictures posed in another world."""
+    """The same pictures, with poses in other world coordinates."""
     return replace(views, cameras=camera.with_poses(views.cameras, views.cameras.extrinsics @ matrix))
 
 
@@ -62,7 +62,7 @@ def balls(scene_class, views=12):
     return Views(scene.over_white(), cameras, (pixels[:, 3:] > 0).float())
 
 
-def test_sampsons_error_is_opencvs():
+def test_the_sampson_error_is_that_of_opencv():
     generator = np.random.default_rng(0)
     pixels = generator.uniform(0, 100, (1, 2, 2))
     matrix = np.array([[80.0, 0, 50], [0, 90, 40], [0, 0, 1]])
@@ -72,12 +72,12 @@ def test_sampsons_error_is_opencvs():
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     fundamental = np.linalg.inv(matrix).T @ cross @ pose[:3, :3] @ np.linalg.inv(matrix)
     homogeneous = [np.append(pixels[0, side], 1.0)[:, None] for side in (0, 1)]
-    expected = cv2.sampsonDistance(homogeneous[0], homogeneous[1], fundamental)  # the square of ours
+    expected = cv2.sampsonDistance(homogeneous[0], homogeneous[1], fundamental)  # the square of the product's error
     ours = sampson(*(torch.from_numpy(each) for each in (pixels, matrix[None], matrix[None], pose[None])))
     assert float(ours) ** 2 == pytest.approx(expected, rel=1e-6)
 
 
-def test_photographs_without_masks_are_checked_by_their_corners():
+def test_photographs_without_masks_are_checked_by_matched_corners():
     views = photographs(8)
     matches = match_pictures(views)
     assert float(matches.errors(views.cameras.extrinsics).median()) < 0.5
@@ -103,7 +103,7 @@ def test_photographs_in_the_axes_of_another_program_are_recognised():
     assert check_gaze(views) == (True, "cameras: 8 of 8 look at one place")
 
 
-def test_cameras_whose_axes_are_parallel_may_look_at_one_place_or_not():
+def test_cameras_with_parallel_axes_may_look_at_one_place_or_not():
     views = photographs(8)
     assert check_gaze(views[:1]) is None
     moved = views.cameras.extrinsics[:1].repeat(8, 1, 1)
@@ -111,8 +111,8 @@ def test_cameras_whose_axes_are_parallel_may_look_at_one_place_or_not():
     assert check_gaze(replace(views, cameras=camera.with_poses(views.cameras, moved))) is None
 
 
-def test_masks_that_agree_under_no_reading_are_wrong(scene):
-    """Poses dealt out at random explain no mask; the relative comparison alone called them right."""
+def test_masks_that_agree_under_no_convention_are_wrong(scene):
+    """Randomly permuted poses agree with no mask; the relative comparison alone accepted them."""
     views = balls(type(scene))
     assert check_conventions(views).consistent
     order = [5, 9, 0, 7, 11, 2, 10, 1, 4, 3, 6, 8]
@@ -130,11 +130,11 @@ def test_one_picture_for_many_poses_is_found(scene):
     names = tuple(f"{index}.png" for index in range(12))
     repeated = replace(views, images=views.images[[0, 1, 2, 0, 0, 5, 6, 7, 8, 9, 10, 0]], names=names)
     assert "4 of 12 poses have the picture of another pose (0.png and 3.png" in check_duplicates(repeated)
-    assert check_duplicates(views[[0, 0, 1]]) is None  # the same view twice is no contradiction
+    assert check_duplicates(views[[0, 0, 1]]) is None  # the same view twice is consistent
 
 
 def test_one_picture_in_support_and_query_is_found(scene, tmp_path):
-    """A copy under another name is another pose's picture; a file listed twice is one view, which the notes say."""
+    """A copy with another name has another pose, and is reported; a file listed twice is one view, with a note."""
     document, home = scene.document(), scene.write(tmp_path)
     shutil.copy(home / scene.names[0], home / scene.names[3])
     document["frames"].append(document["frames"][5])
@@ -144,7 +144,7 @@ def test_one_picture_in_support_and_query_is_found(scene, tmp_path):
     assert f"{home.name}: 1 frames left out, whose images earlier frames list: images/005.png" in found
 
 
-def test_splits_in_different_worlds_are_found(scene):
+def test_splits_with_different_world_coordinates_are_found(scene):
     whole = balls(type(scene), 16)
     support, query = whole[::2], whole[1::2]
     assert check_splits(support, query)[0]

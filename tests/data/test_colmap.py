@@ -1,4 +1,4 @@
-"""Source of truth: the ball of conftest, written as COLMAP's documentation describes its files; OpenCV's distortion."""
+"""Source of truth: the ball of conftest, in files as COLMAP's documentation describes them; OpenCV's distortion."""
 
 import struct
 
@@ -27,7 +27,7 @@ def write(scene, folder, model="PINHOLE", extra=(), binary=False):
     images = []
     for index, pose in enumerate(scene.camera_from_world):
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        name = f"view{7 - index}.png"  # COLMAP's order is not that of the names
+        name = f"view{7 - index}.png"  # COLMAP's order differs from that of the names
         Image.fromarray(scene.pictures[index]).save(folder / "images" / name)
         images.append(([w, x, y, z, *pose[:3, 3]], name))
     home = folder / "sparse/0"
@@ -63,14 +63,14 @@ def test_poses_calibration_and_pictures(scene, tmp_path, model, binary):
     assert open_dataset(tmp_path / "project").names("test") == ["project"]
 
 
-def test_distortion_is_opencvs():
+def test_distortion_is_that_of_opencv():
     points = np.random.default_rng(0).uniform(-0.6, 0.6, (50, 2))
     world = np.concatenate([points, np.ones((50, 1))], 1)
     expected = cv2.projectPoints(world, np.zeros(3), np.zeros(3), np.eye(3), np.array(COEFFICIENTS))[0][:, 0]
     assert np.abs(distort(points, COEFFICIENTS) - expected).max() < 1e-12
 
 
-def test_undistorted_pictures_are_opencvs():
+def test_undistorted_pictures_are_those_of_opencv():
     rows, columns = np.mgrid[:60, :80]
     smooth = np.stack([128 + 100 * np.sin(columns / 9), 128 + 100 * np.cos(rows / 7), rows * 2.0, rows * 0 + 255.0], -1)
     picture = smooth.round().astype(np.uint8)
@@ -82,8 +82,8 @@ def test_undistorted_pictures_are_opencvs():
     assert np.abs(ours - theirs)[whole].max() <= 4, "OpenCV interpolates in steps of 1/32 of a pixel"
 
 
-def test_a_distorted_view_becomes_a_pinholes(scene, tmp_path):
-    """Property: pictures drawn through a lens and read again agree with the pictures of the pinhole."""
+def test_distorted_views_are_read_as_those_of_pinholes(scene, tmp_path):
+    """Property: pictures drawn with distortion are, after reading, those of the pinhole."""
     coefficients = (-0.2, 0.03, 0.0, 0.0)
     full = (*coefficients, 0.0, 0.0, 0.0, 0.0)
     straight = np.stack(scene.pictures)[..., 3] > 0
@@ -120,7 +120,7 @@ def test_a_distorted_view_becomes_a_pinholes(scene, tmp_path):
         ("sparse/0", "images", "sparse/0"),
     ],
 )
-def test_models_and_pictures_in_their_usual_places(scene, tmp_path, model, pictures, given):
+def test_models_and_pictures_are_found_in_their_usual_folders(scene, tmp_path, model, pictures, given):
     whole = write(scene, tmp_path / "whole")
     project = tmp_path / "project"
     (project / model).mkdir(parents=True)
@@ -138,8 +138,8 @@ def test_models_and_pictures_in_their_usual_places(scene, tmp_path, model, pictu
     ("model", "own", "other", "side"),
     [("dense/sparse", "dense/images", "images", 1), ("distorted/sparse/0", "input", "images", 2)],
 )
-def test_a_model_is_of_the_nearest_pictures_of_its_cameras_size(scene, tmp_path, model, own, other, side):
-    """COLMAP's image_undistorter leaves the originals above its model, 3DGS's convert.py its results beside them."""
+def test_a_model_has_the_nearest_pictures_of_the_size_of_its_cameras(scene, tmp_path, model, own, other, side):
+    """The originals are above the model of COLMAP's image_undistorter, and next to the results of 3DGS's convert.py."""
     project = write(scene, tmp_path)
     (project / model).parent.mkdir(parents=True)
     (project / "sparse/0").rename(project / model)

@@ -1,4 +1,4 @@
-"""Source of truth: the masks of a ball, known exactly, that the borders of close-ups cut off."""
+"""Source of truth: exact masks of a ball that the borders of close-ups cut off."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ RADIUS, SIZE = 0.8, 64
 
 @pytest.fixture(scope="module")
 def close_ups():
-    """Nine cameras that see the whole ball and fifteen that stand so close that none does."""
+    """Nine cameras that see the whole ball, and fifteen close ones that see only a part of it."""
     poses = camera.fibonacci_sphere(24, 3.5)
     poses[9:, :3, 3] *= 1.5 / 3.5
     poses = poses[torch.randperm(24, generator=torch.Generator().manual_seed(0))]
@@ -30,19 +30,19 @@ def close_ups():
     return torch.stack(masks).float(), cameras
 
 
-def test_the_sphere_holds_what_close_ups_cut_off(close_ups):
+def test_the_sphere_contains_parts_that_close_ups_cut_off(close_ups):
     masks, cameras = close_ups
     from_cameras = estimate_bounds(cameras)
-    assert from_cameras.radius < RADIUS  # what the narrowest pictures show whole
+    assert from_cameras.radius < RADIUS  # the cameras alone give a smaller sphere
     sphere = estimate_bounds(cameras, (255 * masks).to(torch.uint8))
     reach = RADIUS + torch.tensor(sphere.centre).norm()
     assert reach < 1.05 * sphere.radius
     assert sphere.radius < 1.4 * RADIUS
 
 
-def test_masks_of_the_background_are_told_from_those_of_close_ups(close_ups):
+def test_masks_of_the_background_are_distinguished_from_those_of_close_ups(close_ups):
     masks, _ = close_ups
-    near = masks[masks.flatten(1).mean(1) > 0.8]  # which fill their pictures
+    near = masks[masks.flatten(1).mean(1) > 0.8]  # these fill their pictures
     assert len(near) >= 3
     for found in (masks, near, torch.ones_like(masks), torch.zeros_like(masks), masks[:0]):
         assert not inverted(found).any()
@@ -67,7 +67,7 @@ def test_single_masks_of_the_background_are_found_if_the_others_show_the_object_
 
 
 @pytest.mark.parametrize("has_alpha", [True, False])
-def test_scenes_are_read_with_a_note_about_them(has_alpha):
+def test_inverted_masks_are_noted_when_a_scene_is_read(has_alpha):
     picture = np.full((SIZE, SIZE, 4), 255, np.uint8)
     picture[20:40, 20:40, 3] = 0
     cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.9), camera.fibonacci_sphere(3, 3.5), SIZE, SIZE)
@@ -81,13 +81,13 @@ def test_scenes_are_read_with_a_note_about_them(has_alpha):
     assert any("the principal point lies outside the image: b; check cx and cy" in note for note in found.notes)
 
 
-def test_right_poses_of_close_ups_are_not_called_wrong(close_ups):
+def test_correct_poses_of_close_ups_are_accepted(close_ups):
     masks, cameras = close_ups
     views = Views(1 - 0.5 * masks.expand(-1, 3, -1, -1), cameras, masks)
     assert check_conventions(views).consistent
 
 
-def test_wrong_poses_of_close_ups_still_are(close_ups):
+def test_wrong_poses_of_close_ups_are_found(close_ups):
     masks, cameras = close_ups
     generator = torch.Generator().manual_seed(1)
     moved = camera.camera_from_world(cameras).clone()

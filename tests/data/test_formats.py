@@ -1,4 +1,4 @@
-"""LLFF, IDR and NSVF: each written here as its authors describe it, from projections in closed form.
+"""LLFF, IDR and NSVF, written here as their authors describe them, from projections in closed form.
 
 Source of truth: pixels (u, v) = (f x / z + c) of known points by hand, the readers' cameras must give the same ones.
 """
@@ -16,7 +16,7 @@ VIEWS, HEIGHT, WIDTH, FOCAL = 6, 18, 30, 40.0
 
 
 def eyes_and_axes():
-    """Standpoints, and right, down and forward of cameras that look at the origin, by hand."""
+    """Centres, and right, down and forward axes, of cameras that look at the origin, by hand."""
     for index in range(VIEWS):
         angle = 2 * np.pi * index / VIEWS
         eye = np.array([3 * np.cos(angle), 1.0 + 0.1 * index, 3 * np.sin(angle)])
@@ -27,7 +27,7 @@ def eyes_and_axes():
 
 
 def expected(centre=((WIDTH - 1) / 2, (HEIGHT - 1) / 2)):
-    """Pixels (view, point, 2) at integer pixel centres."""
+    """Pixels (view, point, 2), with pixel centres at integers."""
     pixels = []
     for eye, right, down, forward in eyes_and_axes():
         x, y, z = ((POINTS - eye) @ axis for axis in (right, down, forward))
@@ -55,7 +55,7 @@ def llff(folder, **change):
 
 
 def test_llff(tmp_path):
-    """The file describes pictures of twice the size, of which only those scaled down are there."""
+    """The file describes pictures of twice the size; only the downscaled ones exist."""
     llff(tmp_path)
     views = read_views(tmp_path)
     np.testing.assert_allclose(found(views), expected(), atol=1e-3)
@@ -70,8 +70,8 @@ def test_llff(tmp_path):
         read_views(tmp_path)
 
 
-def test_masks_beside_the_pictures_of_llff(tmp_path):
-    """Source of truth: the masks as they are written; the program's own advice is to add the folder."""
+def test_masks_next_to_the_pictures_of_llff(tmp_path):
+    """Source of truth: the written masks. The product's error message says to add that folder."""
     llff(tmp_path)
     names = [f"IMG_{index}.png" for index in range(VIEWS)]
     for index, name in enumerate(names):
@@ -85,8 +85,8 @@ def test_masks_beside_the_pictures_of_llff(tmp_path):
         read_views(tmp_path)
 
 
-def test_forward_facing_cameras_have_their_bounds_ahead(tmp_path):
-    """By hand: cameras on a plane, all looking along -z; halfway between 2 and 6 in disparity is a depth of 3."""
+def test_forward_facing_cameras_have_their_bounds_before_them(tmp_path):
+    """By hand: cameras on a plane look along -z. The mean disparity of depths 2 and 6 is that of depth 3."""
     rows = []
     for x in (-0.2, 0.0, 0.2):
         axes = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # columns: down = -y, right = x, backwards = z
@@ -101,14 +101,14 @@ def test_forward_facing_cameras_have_their_bounds_ahead(tmp_path):
 
 @pytest.mark.parametrize("name", ["cameras.npz", "cameras_sphere.npz"])
 def test_idr(tmp_path, name):
-    """The unit sphere is moved and scaled into the world of the projections; masks cut the object out."""
+    """The projections are of a world in which the unit sphere is moved and scaled. There are masks of the object."""
     scale, shift = 2.5, np.array([1.0, -2.0, 0.5])
     arrays = {}
     for index, (eye, right, down, forward) in enumerate(eyes_and_axes()):
         rotation = np.stack([right, down, forward])
         matrix = np.array([[FOCAL, 0, 14.0], [0, FOCAL, 9.0], [0, 0, 1]])
         pose = np.concatenate([rotation, -rotation @ (scale * eye + shift)[:, None]], 1)
-        arrays[f"world_mat_{index}"] = np.vstack([-3.0 * matrix @ pose, [0, 0, 0, 1]])  # a projection has no scale
+        arrays[f"world_mat_{index}"] = np.vstack([-3.0 * matrix @ pose, [0, 0, 0, 1]])  # of any scale
         arrays[f"scale_mat_{index}"] = np.diag([scale, scale, scale, 1.0])
         arrays[f"scale_mat_{index}"][:3, 3] = shift
     np.savez(tmp_path / name, **arrays)

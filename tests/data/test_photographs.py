@@ -1,4 +1,4 @@
-"""Source of truth: the ball of conftest, its files changed as cameras, phones and people change them."""
+"""Source of truth: the ball of conftest, with files changed as cameras, phones and users change them."""
 
 import io
 import json
@@ -26,7 +26,7 @@ def jpeg(path, picture, orientation):
 
 
 def balls(views, masks):
-    """How far the centre of each mask is from where the ball's centre is projected, in pixels."""
+    """The distance in pixels between the centroid of each mask and the projection of the ball's centre."""
     centre = torch.tensor([[[0.1, 0.2, 0.0]]]).expand(len(views), 1, 3)
     for mask, pixel in zip(masks, views.cameras.project(centre), strict=True):
         rows, columns = torch.nonzero(mask, as_tuple=True)
@@ -34,8 +34,8 @@ def balls(views, masks):
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_pictures_are_turned_where_the_stated_size_says_so(scene, tmp_path, orientation):
-    """The stored pixels are the upright ones turned back by NumPy; the file states the upright or the stored size."""
+def test_pictures_are_rotated_if_the_stated_size_requires_it(scene, tmp_path, orientation):
+    """The stored pixels are upright ones, rotated back by NumPy. The file states the upright or the stored size."""
     (tmp_path / "images").mkdir()
     document = scene.document(w=32, h=24)
     back = {
@@ -58,7 +58,7 @@ def test_pictures_are_turned_where_the_stated_size_says_so(scene, tmp_path, orie
         with pytest.warns(UserWarning, match="8 images rotated by their EXIF orientation: images/000.jpg"):
             views = read_views(tmp_path)
     else:
-        views = read_views(tmp_path)  # as COLMAP and nerfstudio: the pixels as they are stored
+        views = read_views(tmp_path)  # pixels as they are stored, as in COLMAP and nerfstudio
     assert max(balls(views, views.images[:, 0] > 0.5)) < 0.6
     del document["w"], document["h"]
     (tmp_path / "transforms.json").write_text(json.dumps(document))
@@ -85,7 +85,7 @@ def test_pictures_are_turned_where_the_stated_size_says_so(scene, tmp_path, orie
         ),
     ],
 )
-def test_what_cannot_be_right_is_refused_by_name(scene, tmp_path, fields, match):
+def test_impossible_values_are_refused_by_name(scene, tmp_path, fields, match):
     with pytest.raises(DataError, match=match):
         read_views(scene.write(tmp_path, scene.document(**fields)))
 
@@ -117,8 +117,8 @@ def test_frames_that_are_missing_are_left_out_and_named(scene, tmp_path):
     assert torch.allclose(camera.camera_from_world(task.query.cameras), pose, atol=1e-6)
 
 
-def test_pictures_of_several_sizes_become_one(scene, tmp_path):
-    """Property: the ball's centre still projects onto the middle of every silhouette."""
+def test_pictures_of_several_sizes_are_scaled_to_one(scene, tmp_path):
+    """Property: the ball's centre is projected to the centroid of every silhouette."""
     folder = scene.write(tmp_path)
     for name in scene.names[:2]:
         with Image.open(tmp_path / name) as image:
@@ -131,7 +131,7 @@ def test_pictures_of_several_sizes_become_one(scene, tmp_path):
 
 
 def test_portraits_among_landscapes_keep_their_geometry(scene, tmp_path):
-    """Property: the ball's centre is projected onto the middle of every silhouette; the hull is that of landscapes."""
+    """Property: the ball's centre is projected to the centroid of every silhouette; the hull is that of landscapes."""
     folder = scene.write(tmp_path)
     landscapes = read_views(folder)
     upright = type(scene)(size=(40, 30))
@@ -150,7 +150,7 @@ def test_portraits_among_landscapes_keep_their_geometry(scene, tmp_path):
 
 
 def test_scaling_down_keeps_the_geometry(scene, tmp_path):
-    """By hand: 33 x 25 pixels by 4 are 8 x 6, f / 4, and (c + 1/2) / 4 - 1/2; colours are means over white."""
+    """By hand: 33 x 25 pixels become 8 x 6, with f / 4 and (c + 1/2) / 4 - 1/2; colours are means over white."""
     big = type(scene)(size=(25, 33))
     folder = big.write(tmp_path)
     with pytest.warns(UserWarning, match="scaled down by 4, to 8 x 6 pixels"):
@@ -190,7 +190,7 @@ def test_bounds_are_those_of_the_support(scene, tmp_path):
 
 
 @pytest.mark.parametrize("place", [".", "images", "input"])
-def test_photographs_without_poses_are_told_how_to_get_them(scene, tmp_path, place):
+def test_for_photographs_without_poses_the_error_says_how_to_get_them(scene, tmp_path, place):
     (tmp_path / place).mkdir(exist_ok=True)
     for index in range(3):
         Image.fromarray(scene.pictures[index]).convert("RGB").save(tmp_path / place / f"{index}.JPG", "JPEG")
@@ -202,14 +202,14 @@ def test_photographs_without_poses_are_told_how_to_get_them(scene, tmp_path, pla
 
 
 @pytest.mark.parametrize("given", ["walk.webm", "."])
-def test_a_video_without_poses_is_told_how_to_get_them(given, tmp_path):
+def test_for_a_video_without_poses_the_error_says_how_to_get_them(given, tmp_path):
     (tmp_path / "walk.webm").touch()
     (tmp_path / "notes.txt").touch()
     with pytest.raises(DataError, match=rf"found a video; find .*: hyperplanes capture {tmp_path}/walk.webm "):
         read_views(tmp_path / given)
 
 
-def test_photographs_of_a_phone_count(tmp_path):
+def test_heic_photographs_of_a_phone_are_counted(tmp_path):
     for index in range(3):
         (tmp_path / f"{index}.HEIC").touch()
     with pytest.raises(DataError, match=r"found 3 photographs and no poses; find them: hyperplanes capture "):
@@ -217,7 +217,7 @@ def test_photographs_of_a_phone_count(tmp_path):
 
 
 def test_a_linked_folder_of_pictures_inside_the_tree_is_followed(scene, tmp_path):
-    """The tree given holds scenes; the pictures of one lie beside it. Given alone, the scene's link leads out of it."""
+    """The pictures of a scene are next to it in the given folder. Given alone, its link leads outside."""
     from hyperplanes.data import open_dataset
 
     document = scene.document()
@@ -234,7 +234,7 @@ def test_a_linked_folder_of_pictures_inside_the_tree_is_followed(scene, tmp_path
 
 
 def masks_of_widths(paths):
-    """Masks of 8 x 8 pixels, of which the first one's first column is set, the second one's first two, and so on."""
+    """Write masks of 8 x 8 pixels: the first has one column set, the second two, and so on."""
     for width, path in enumerate(paths, 1):
         path.parent.mkdir(parents=True, exist_ok=True)
         mask = np.zeros((8, 8), np.uint8)
@@ -252,7 +252,7 @@ def test_masks_of_one_name_belong_to_the_pictures_of_their_folders(tmp_path):
 
 
 @pytest.mark.parametrize("transparent", [False, True])
-def test_a_mask_is_that_of_a_picture_whose_alpha_says_nothing(transparent, tmp_path):
+def test_a_mask_is_used_for_a_picture_with_an_opaque_alpha_channel(transparent, tmp_path):
     picture = np.full((8, 8, 4), 200, np.uint8)
     picture[..., 3] = 255
     picture[0, 0, 3] -= transparent
@@ -267,14 +267,14 @@ def test_a_mask_is_that_of_a_picture_whose_alpha_says_nothing(transparent, tmp_p
 
 
 @pytest.mark.parametrize("white", [1.0, 255.0, 65535.0])
-def test_floating_point_pictures_are_as_bright_as_they_say(white, tmp_path):
+def test_floating_point_pictures_are_scaled_by_their_range(white, tmp_path):
     Image.fromarray(np.linspace(0, white, 64, dtype=np.float32).reshape(8, 8)).save(tmp_path / "mask.tiff")
     pixels, _ = read_image(tmp_path / "mask.tiff")
     np.testing.assert_allclose(pixels[..., 0].flatten(), np.linspace(0, 255, 64), atol=0.51)
 
 
 @pytest.mark.parametrize("how", [Image.Resampling.BICUBIC, Image.Resampling.LANCZOS])
-def test_a_mask_that_overshoots_where_it_was_scaled_is_as_if_it_had_been_clipped(how, tmp_path):
+def test_masks_that_overshoot_after_resampling_are_clipped(how, tmp_path):
     mask = np.zeros((12, 12), np.float32)
     mask[3:9, 3:9] = 1.0
     scaled = Image.fromarray(mask).resize((30, 30), how)
@@ -287,23 +287,23 @@ def test_a_mask_that_overshoots_where_it_was_scaled_is_as_if_it_had_been_clipped
 @pytest.mark.parametrize(
     ("mask", "has_alpha", "opacity"), [((0, 255), True, 0), ((0, 90), True, 90), ((80, 255), False, 80)]
 )
-def test_a_mask_says_by_its_alpha_what_its_colours_do_not(mask, has_alpha, opacity):
+def test_masks_of_one_colour_are_read_from_their_alpha_channel(mask, has_alpha, opacity):
     grey, alpha = mask
     pixels = np.full((2, 2, 4), grey, np.uint8)
     pixels[..., 3] = alpha
     assert (opacity_of(pixels, has_alpha) == opacity).all()
 
 
-def test_a_cut_out_is_a_mask_by_its_alpha():
-    """A dark object on a light ground, as programs that take away the background write it."""
+def test_a_cut_out_is_read_from_its_alpha_channel():
+    """A dark object on a light background, as programs that remove backgrounds write it."""
     pixels = np.full((2, 2, 4), 220, np.uint8)
     pixels[0, 0], pixels[..., 3] = 60, 0
     pixels[0, 0, 3] = 255
     assert opacity_of(pixels, True).tolist() == [[255, 0], [0, 0]]
 
 
-def test_heic_is_read_once_pillow_heif_has_registered_it(tmp_path, monkeypatch):
-    # a stand-in for its opener: a PNG behind eight other bytes
+def test_heic_is_read_after_pillow_heif_has_registered_it(tmp_path, monkeypatch):
+    # a replacement of its opener reads a PNG after eight other bytes
     monkeypatch.setattr(Image, "OPEN", dict(Image.OPEN))
     monkeypatch.setattr(Image, "ID", list(Image.ID))
     path = tmp_path / "a.heic"
@@ -323,7 +323,7 @@ def test_heic_is_read_once_pillow_heif_has_registered_it(tmp_path, monkeypatch):
 
 
 def test_masks_of_zeros_and_ones_are_black_and_white():
-    """As NumPy's `mask.astype(np.uint8)` has them."""
+    """NumPy's `mask.astype(np.uint8)` has such values."""
     pixels = np.zeros((2, 2, 4), np.uint8)
     pixels[0, :, :3], pixels[..., 3] = 1, 255
     assert opacity_of(pixels, False).tolist() == [[255, 255], [0, 0]]

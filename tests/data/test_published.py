@@ -1,4 +1,4 @@
-"""NMR, CO3D, Objaverse and OmniObject3D, each written here as its authors describe it.
+"""NMR, CO3D, Objaverse and OmniObject3D, written here as their authors describe them.
 
 Source of truth: pixels of known points by hand, as in test_formats; axes and units as pixelNeRF's loader (NMR), CO3D's
 data_types.py and Implicitron, Zero-1-to-3's Blender script and OmniObject3D's loader state them.
@@ -17,7 +17,7 @@ from hyperplanes.data import DataError, open_dataset, read_views
 
 
 def poses():
-    """camera_from_world (3, 4), OpenCV axes."""
+    """Matrices camera_from_world (3, 4) with OpenCV axes."""
     for eye, right, down, forward in eyes_and_axes():
         rotation = np.stack([right, down, forward])
         yield np.concatenate([rotation, -rotation @ eye[:, None]], 1)
@@ -52,7 +52,7 @@ def test_nmr(tmp_path):
 
 @pytest.mark.parametrize("kind", ["ndc_isotropic", "ndc_norm_image_bounds"])
 def test_co3d(tmp_path, kind):
-    """By hand: x left and y up of PyTorch3D are -x and -y of OpenCV, and x_world R is R^T x_world."""
+    """By hand: PyTorch3D has x left and y up, the -x and -y of OpenCV, and multiplies row vectors, x_world R."""
     flip = np.diag([-1.0, -1.0, 1.0])
     unit = np.array([HEIGHT / 2] * 2 if kind == "ndc_isotropic" else [WIDTH / 2, HEIGHT / 2])
     frames = []
@@ -95,7 +95,7 @@ def test_co3d(tmp_path, kind):
 
 
 def test_objaverse(tmp_path):
-    """By hand: a lens of 35 mm on 32 mm is 35 / 32 of the width; the points are moved to where that lens sees them."""
+    """By hand: a focal length of 35 mm on 32 mm is 35 / 32 of the width; points are at the pixels of that lens."""
     for name in "ab":
         pictures(tmp_path / name, [f"{index:03d}.png" for index in range(VIEWS)], "RGBA")
         for index, pose in enumerate(poses()):

@@ -1,6 +1,6 @@
-"""What lies in a data set that somebody else made: pipes, devices, links, and pictures that start other programs.
+"""Dangerous files in data sets of others: pipes, devices, links, and pictures that start other programs.
 
-Source of truth: no reader opens anything but regular files inside the folder that it was given.
+Source of truth: a reader opens only regular files inside the given folder.
 """
 
 import os
@@ -33,8 +33,8 @@ def made(kind, home):
 
 @pytest.mark.parametrize("kind", LAYOUTS)
 @pytest.mark.parametrize("instead", ["a pipe", "a device", "a link out of the folder"])
-def test_nothing_but_regular_files_inside_the_folder_is_opened(tmp_path, kind, instead):
-    """One file of each kind that the layout has, in turn."""
+def test_only_regular_files_inside_the_folder_are_opened(tmp_path, kind, instead):
+    """One file of each kind of the layout in turn."""
     folder, files, read = made(kind, tmp_path)
     for path in files:
         content, secret = path.read_bytes(), tmp_path / f"secret{path.suffix}"
@@ -65,8 +65,8 @@ def test_links_inside_the_folder_are_followed(tmp_path, kind):
     read(folder)
 
 
-def test_a_picture_is_never_handed_to_another_program(tmp_path, monkeypatch):
-    """Pillow renders PostScript by starting Ghostscript, whatever the file is called."""
+def test_a_picture_starts_no_other_program(tmp_path, monkeypatch):
+    """Pillow starts Ghostscript to render PostScript, for any name of the file."""
     started = []
     monkeypatch.setattr("PIL.EpsImagePlugin.Ghostscript", lambda *arguments, **options: started.append(arguments))
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "a.eps")
@@ -78,7 +78,7 @@ def test_a_picture_is_never_handed_to_another_program(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("read", [read_experiment, read_json])
 @pytest.mark.parametrize("instead", ["/dev/zero", None])
-def test_settings_are_regular_files(tmp_path, read, instead):
+def test_settings_have_to_be_regular_files(tmp_path, read, instead):
     path = tmp_path / "config.yaml"
     if instead is None:
         os.mkfifo(path)

@@ -1,6 +1,6 @@
-"""What `inspect` says of a scene's views.
+"""The report of `inspect` about a scene's views.
 
-Source of truth: areas of spherical caps, angles by hand, and damage that is done here to one view on purpose.
+Source of truth: areas of spherical caps, angles by hand, and known damage to one view.
 """
 
 import math
@@ -25,7 +25,7 @@ SIZE = 48
 
 
 def standing(*angles):
-    """Grey views without masks from azimuths and elevations in degrees."""
+    """Grey views without masks, from azimuths and elevations in degrees."""
     azimuth, elevation = torch.deg2rad(torch.tensor(angles, dtype=torch.float64)).T
     flat = elevation.cos()
     eyes = 3 * torch.stack([flat * azimuth.sin(), elevation.sin(), flat * azimuth.cos()], -1)
@@ -35,7 +35,7 @@ def standing(*angles):
 
 
 def ball():
-    """Twelve views of a ball with noise on it."""
+    """Twelve views of a ball with a texture of noise."""
     views = standing(*((30 * index, 20 * (-1) ** index) for index in range(12)))
     rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
     middle = (SIZE - 1) / 2
@@ -44,7 +44,7 @@ def ball():
     return replace(views, images=noise * mask + 1 - mask, masks=mask.clone())
 
 
-def test_coverage_is_the_area_of_caps():
+def test_coverage_is_the_area_of_spherical_caps():
     report = describe_scene(standing((0, 0), (180, 0)))
     assert report.covered == pytest.approx(1 - math.cos(math.radians(30)), abs=0.01), "two caps of (1 - cos 30) / 2"
     assert (report.above, report.below, report.gap) == (0.0, 0.0, None)
@@ -53,7 +53,7 @@ def test_coverage_is_the_area_of_caps():
     assert "only from near where the views stand" in replace(report, masked=True).expectation()
 
 
-def test_masks_that_show_the_background_are_to_be_inverted():
+def test_masks_of_the_background_are_reported_as_inverted():
     views = ball()
     assert describe_scene(views).expectation().startswith("good pictures")
     found = describe_scene(replace(views, masks=1 - views.masks)).expectation()
@@ -67,7 +67,7 @@ def test_masks_that_show_the_background_are_to_be_inverted():
 
 
 def test_the_widest_gap_lies_between_views_that_are_named():
-    """A view that looks steeply down closes no gap."""
+    """A view that looks steeply down does not divide a gap."""
     report = describe_scene(standing(*((20 * index, 10) for index in range(11)), (280, 85)))
     assert report.views[11].faults == ("no other within 79 degrees",)
     width, left, right = report.gap
@@ -76,7 +76,7 @@ def test_the_widest_gap_lies_between_views_that_are_named():
     assert "gap: nothing was seen from 160 degrees around between 10.png and 0.png" in report.lines()
 
 
-def test_a_right_scene_has_no_faults():
+def test_a_correct_scene_has_no_faults():
     report = describe_scene(ball())
     assert report.is_sound
     fits = [view.agreement for view in report.views]
@@ -102,7 +102,7 @@ def test_a_wrong_mask_and_a_blurred_picture_are_named():
 
 @pytest.mark.parametrize("binary", [False, True])
 def test_reprojection_errors_of_colmap(tmp_path, binary):
-    """Three points of errors 1, 2 and 6 pixels; a.png shows the first two, b.png all of them."""
+    """Three points have errors of 1, 2 and 6 pixels; a.png shows the first two, b.png all three."""
     tracks = [((0, 1, 2), 1.0, (4, 9)), ((3, 4, 5), 2.0, (4, 9)), ((6, 7, 8), 6.0, (9,))]
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 4 4 4 4 2 2\n")
     (tmp_path / "images.txt").write_text("4 1 0 0 0 0 0 0 1 a.png\n\n9 1 0 0 0 0 0 0 1 b.png\n\n")
@@ -130,7 +130,7 @@ def test_reprojection_errors_of_colmap(tmp_path, binary):
 
 
 def test_the_silhouette_of_a_solid_hull_has_no_gaps():
-    """A ball covers a disc, whatever the pixels that a voxel covers; holes filled (SciPy) change nothing."""
+    """A ball covers a disc for any number of pixels per voxel. SciPy's filling of holes changes nothing."""
     from scipy.ndimage import binary_fill_holes
 
     from hyperplanes.data.inspection.silhouettes import silhouettes
@@ -140,7 +140,7 @@ def test_the_silhouette_of_a_solid_hull_has_no_gaps():
 
     hull = full(Sphere(), 24)
     ball = Occupancy((hull.centres().norm(dim=-1) < 1).reshape(24, 24, 24), hull.bounds)
-    for focal in (40.0, 60.0, 75.0):  # 1.1, 1.7 and 2.1 pixels a voxel
+    for focal in (40.0, 60.0, 75.0):  # 1.1, 1.7 and 2.1 pixels per voxel
         calibration = torch.tensor([[[focal, 0, 63.5], [0, focal, 63.5], [0, 0, 1]]])
         cameras = camera.pinhole(calibration, camera.orbit(3, 3.0, 0.3)[:1], 128, 128)
         seen = silhouettes(ball.centres(), ball, cameras)[0].numpy()

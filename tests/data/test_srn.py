@@ -1,4 +1,4 @@
-"""Source of truth: the ball of conftest, written as SRN's data are."""
+"""Source of truth: the ball of conftest, in the layout of SRN's data."""
 
 import numpy as np
 import pytest
@@ -34,11 +34,11 @@ def test_pictures_poses_and_calibration(scene, tmp_path):
     assert torch.allclose(camera.intrinsics(views.cameras), wanted, atol=1e-4)
 
 
-def test_no_masks_are_made_up_where_the_background_is_not_white(scene, tmp_path):
+def test_without_a_white_background_there_are_no_masks(scene, tmp_path):
     assert read_views(write(scene, tmp_path, white=False)).masks is None
 
 
-def test_splits_are_the_folders_names(scene, tmp_path):
+def test_splits_are_the_names_of_the_folders(scene, tmp_path):
     for home in ("cars_train/a", "cars_train/b", "cars_val/c", "cars_test/d"):
         write(scene, tmp_path / home)
     data = open_dataset(tmp_path)

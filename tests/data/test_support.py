@@ -1,4 +1,4 @@
-"""Source of truth: the views of a task themselves."""
+"""Source of truth: the views of the original task."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def test_the_support_is_its_first_views_and_then_those_of_the_query(count):
 
 
 def test_a_sphere_of_radius_2_seen_from_4_is_near_2_and_far_6():
-    # near and far of learnit and of the authors' code, for every ray, whatever the masks show
+    # near and far of learnit and of the authors' code, for every ray and any masks
     data = WithBounds(Balls(), Sphere((0.0, 0.0, 0.0), 2.0))
     for views in (data.task("train1").support, data.task("train1").query):
         distance = centres(views.cameras).norm(dim=1)
@@ -42,7 +42,7 @@ def test_a_sphere_of_radius_2_seen_from_4_is_near_2_and_far_6():
         torch.testing.assert_close(rays.far, (distance[0] + 2).expand_as(rays.far))
 
 
-def test_more_views_than_there_are_and_none_are_refused():
+def test_too_many_views_and_none_are_refused():
     with pytest.raises(ValueError, match="train0: expected 9 views for the support, got 8; --support 8 takes all"):
         WithSupport(Balls(), 9).task("train0")
     with pytest.raises(ValueError, match="support: expected at least 1 view, got 0"):
@@ -53,7 +53,7 @@ def test_fifty_planes_are_trained_and_evaluated_with_support_and_query_unified()
     data = WithSupport(Balls(train=1, views=25), 50)
     network = TargetConfig(depth=2, width=16, planes=50, point_frequencies=2, direction_frequencies=1)
     hypernetwork = ImageHyperNetworkConfig(views=50, normalisation="group", code=2, depth=1, width=8)
-    model = HyperPlanes(small_model(network=network, hypernetwork=hypernetwork).config)  # which has no rig yet
+    model = HyperPlanes(small_model(network=network, hypernetwork=hypernetwork).config)  # without a rig
     trainer = train(model, data, TrainingConfig(steps=1, tasks=1, rays=16, held_out=0))
     assert trainer.model.rig.shape == (50, 3)
     task = data.task("test0")
@@ -73,8 +73,8 @@ def test_the_single_view_of_an_object_is_always_the_same():
 
 
 @pytest.mark.parametrize("named", [True, False])
-def test_inputs_are_counted_in_the_order_of_their_names(named):
-    """As pixelNeRF does with SRN's pictures; views without names are counted support first."""
+def test_inputs_are_numbered_in_the_order_of_their_names(named):
+    """As pixelNeRF does with SRN's pictures. Without names, the support comes before the query."""
 
     class Alternating(Balls):
         def task(self, name):

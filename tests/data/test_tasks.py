@@ -1,4 +1,4 @@
-"""Source of truth: the pictures of conftest; counts of what is read from disk."""
+"""Source of truth: the pictures of conftest, and counts of reads from disk."""
 
 import io
 import json
@@ -40,7 +40,7 @@ def test_names_and_length(folder):
         data.names("dev")
 
 
-def test_pictures_are_kept_and_callers_cannot_spoil_them(folder, scene):
+def test_pictures_are_cached_and_callers_cannot_change_them(folder, scene):
     data = Dataset(folder)
     first = data.task("a")
     first.support.images.zero_()
@@ -51,7 +51,7 @@ def test_pictures_are_kept_and_callers_cannot_spoil_them(folder, scene):
     assert float(again.support.masks.max()) == 1.0
 
 
-def test_several_data_sets_are_one_whose_names_say_which(tmp_path, folder):
+def test_several_data_sets_are_one_with_prefixed_names(tmp_path, folder):
     copies = [tmp_path / "copies" / name for name in ("a", "b")]
     for copy in copies:
         shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("copies"))
@@ -68,7 +68,7 @@ def test_several_data_sets_are_one_whose_names_say_which(tmp_path, folder):
         open_datasets([copies[0], tmp_path / "a"])
 
 
-def test_the_budget_is_kept_and_the_least_recently_used_goes_first(folder):
+def test_the_least_recently_used_objects_are_evicted_at_the_budget(folder):
     one = Dataset(folder).posed("a").nbytes
     data = Dataset(folder, budget=2 * one)
     for name in ("a", "b", "a", "c"):
@@ -86,7 +86,7 @@ def test_the_budget_is_kept_and_the_least_recently_used_goes_first(folder):
     assert small.posed("c") is not small.posed("c")
 
 
-def test_files_are_written_whole_or_not_at_all(tmp_path):
+def test_files_are_written_completely_or_not_at_all(tmp_path):
     path = tmp_path / "deep/file"
     write_whole(path, b"first")
     write_whole(path, b"second")
@@ -112,7 +112,7 @@ def test_encoding_is_deterministic(scene):
     assert encode_npz(arrays) == encode_npz(arrays)
 
 
-def test_a_huge_json_is_refused_unread(tmp_path):
+def test_a_huge_json_file_is_refused_without_reading_it(tmp_path):
     path = tmp_path / "transforms.json"
     with open(path, "wb") as file:
         file.truncate(300 * 2**20)
@@ -121,7 +121,7 @@ def test_a_huge_json_is_refused_unread(tmp_path):
 
 
 def test_writing_needs_no_torch():
-    """Property: the generator and its workers start without torch, in a third of the time and of the memory."""
+    """Property: the generator and its workers start without torch, with a third of the time and memory."""
     modules = "hyperplanes.data.formats.transforms_document, data_gen.datasets.generate"
     code = f"import {modules}, sys; print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

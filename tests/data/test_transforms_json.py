@@ -1,4 +1,4 @@
-"""Source of truth: a ball whose pictures are computed in closed form (conftest), and numbers worked out by hand."""
+"""Source of truth: a ball with pictures in closed form (conftest), and numbers by hand."""
 
 import json
 import re
@@ -32,8 +32,8 @@ def test_blender_pictures_poses_and_calibration(scene, tmp_path):
     assert views.names == tuple(scene.names)
 
 
-def test_the_balls_centre_projects_onto_the_middle_of_its_silhouettes(scene, tmp_path):
-    """Property: the convention is right when geometry and pictures agree to a third of a pixel."""
+def test_the_centre_of_the_ball_is_projected_to_the_centroid_of_its_silhouettes(scene, tmp_path):
+    """Property: with the right convention, geometry and pictures agree to 0.35 pixels."""
     views = read_views(scene.write(tmp_path))
     points = torch.tensor(scene.centre).float().expand(len(views), 1, 3)
     pixels = views.cameras.project(points)[:, 0]
@@ -51,16 +51,16 @@ def test_legacy_reading_moves_the_principal_point_by_half_a_pixel(scene, tmp_pat
 
 
 def test_nerfstudio_fields_are_scaled_to_the_size_of_the_pictures(scene, tmp_path):
-    """By hand: the file describes 64 x 48 pictures, the pictures have half of that."""
+    """By hand: the file describes pictures of 64 x 48; the pictures have half that size."""
     document = scene.document(fl_x=100.0, fl_y=90.0, cx=30.0, cy=25.0, w=64, h=48, camera_model="OPENCV")
     matrix = camera.intrinsics(read_views(scene.write(tmp_path, document)).cameras)[0]
     assert matrix.tolist() == [[50.0, 0.0, 14.5], [0.0, 45.0, 12.0], [0.0, 0.0, 1.0]]
 
 
-def test_k4_of_nerfstudio_is_that_of_the_eighth_power_of_the_radius(scene, tmp_path):
+def test_k4_of_nerfstudio_is_the_coefficient_of_the_eighth_power_of_the_radius(scene, tmp_path):
     """`camera_utils._compute_residual_and_jacobian` of nerfstudio: 1 + r (k1 + r (k2 + r (k3 + r k4))), r = x^2 + y^2.
 
-    OpenCV's own k4 is the first coefficient below its quotient.
+    OpenCV's k4 is the first coefficient of the denominator.
     """
     k = (-0.1, 0.05, -0.02, 0.06)
     lens = dict(zip(("k1", "k2", "k3", "k4"), k, strict=True))
@@ -76,14 +76,14 @@ def test_k4_of_nerfstudio_is_that_of_the_eighth_power_of_the_radius(scene, tmp_p
         np.testing.assert_allclose(distort(points, found), points * factor, atol=1e-5)
 
 
-def test_a_frames_own_calibration_wins(scene, tmp_path):
+def test_the_calibration_of_a_frame_takes_precedence(scene, tmp_path):
     document = scene.document(fl_x=100.0)
     document["frames"][1]["fl_x"] = 50.0
     focal = camera.intrinsics(read_views(scene.write(tmp_path, document)).cameras)[:3, 0, 0]
     assert focal.tolist() == [100.0, 50.0, 100.0]
 
 
-def test_what_is_written_is_read_again(scene, tmp_path):
+def test_written_files_are_read_back(scene, tmp_path):
     document = transforms_document(
         np.linalg.inv(scene.camera_from_world),
         np.tile(scene.matrix, (8, 1, 1)),
@@ -103,8 +103,8 @@ def test_what_is_written_is_read_again(scene, tmp_path):
     assert torch.allclose(rays.directions, other.directions, atol=1e-6)
 
 
-def test_a_scene_at_coordinates_of_a_map_loses_no_pixel(scene, tmp_path):
-    """Closed form: a scene moved as a whole shows its points at the same pixels. At 4e6, float32 has steps of 0.25."""
+def test_a_scene_at_map_coordinates_keeps_its_pixels(scene, tmp_path):
+    """Closed form: a moved scene has its points at the same pixels. At 4e6, float32 has steps of 0.25."""
     offset = np.array([512_345.678, 4_198_765.432, 210.5])
     document = scene.document(scene_sphere={"centre": (scene.centre + offset).tolist(), "radius": 0.7})
     for frame in document["frames"]:
@@ -126,7 +126,7 @@ def test_a_scene_at_coordinates_of_a_map_loses_no_pixel(scene, tmp_path):
         )
     assert not any("shifted" in note for note in read_posed_task(tmp_path / "near").notes)
     assert read_posed_task(tmp_path / "near").support.origin == (0.0, 0.0, 0.0)
-    # a camera path of the same poses, in the world of the files
+    # a camera path with the same poses, in the world of the files
     frames = [{"camera_to_world": each["transform_matrix"], "fov": 60.0} for each in document["frames"]]
     path = tmp_path / "path.json"
     path.write_text(json.dumps({"render_width": 8, "render_height": 8, "camera_path": frames}))
@@ -151,7 +151,7 @@ def test_train_and_test_files_are_support_and_query(scene, tmp_path):
 
 @pytest.mark.parametrize("folder", ["./abc", "/data/rgb", "../../rgb"])
 def test_an_object_of_learnit_is_read_alone_and_in_its_data_set(scene, tmp_path, folder):
-    """As published: cars/abc/transforms.json lists ./abc/000, and its loader takes the last part, beside the file."""
+    """As published: cars/abc/transforms.json lists ./abc/000, and its loader takes the last part, next to the file."""
     home = tmp_path / "cars/abc"
     scene.write(home)
     document = scene.document()
@@ -166,8 +166,8 @@ def test_an_object_of_learnit_is_read_alone_and_in_its_data_set(scene, tmp_path,
     assert alone.names == tuple(Path(name).name for name in scene.names)
 
 
-def test_no_picture_is_both_shown_and_asked_for(scene, tmp_path):
-    """Property: support and query are disjoint, however the files name a picture that is in both."""
+def test_no_picture_is_in_both_support_and_query(scene, tmp_path):
+    """Property: support and query are disjoint, even if the files name one picture in different ways."""
     document, names = scene.document(), scene.names
     lists = {"train_filenames": names[:5], "test_filenames": [f"./{name}" for name in names[4:]]}
     scene.write(tmp_path / "lists", document | lists)
@@ -199,7 +199,7 @@ def test_views_alternate_without_a_split(scene, tmp_path):
 
 
 def test_the_sphere_is_estimated_around_the_hull_of_the_masks(scene, tmp_path):
-    """The ball has radius 0.5; voxels, coarse pictures and the margin make its sphere larger, by less than a half."""
+    """The ball has radius 0.5. Voxels, coarse pictures and the margin enlarge its sphere by less than a half."""
     bounds = read_views(scene.write(tmp_path)).bounds
     assert np.linalg.norm(np.array(bounds.centre) - scene.centre) < 0.1
     assert 0.5 < bounds.radius < 0.75
@@ -230,8 +230,8 @@ def test_the_chair_of_blenders_format():
     assert 1.0 < task.support.bounds.radius < 1.5
 
 
-def test_a_file_of_another_name_is_all_there_is_of_a_scene(scene, tmp_path):
-    """Beside transforms.json with all frames lies a file with some of them."""
+def test_a_file_of_another_name_defines_the_whole_scene(scene, tmp_path):
+    """A file with some of the frames is next to transforms.json, which has all."""
     scene.write(tmp_path)
     document = scene.document()
     document["frames"] = document["frames"][:6:2]
@@ -244,8 +244,8 @@ def test_a_file_of_another_name_is_all_there_is_of_a_scene(scene, tmp_path):
     assert whole.name == task.name == tmp_path.name
 
 
-def test_a_camera_path_is_in_the_world_of_the_file_whether_it_or_its_folder_is_named(scene, tmp_path):
-    """nerfstudio's world is that of the file times dataparser_transforms.json, without `applied_transform`."""
+def test_a_camera_path_is_in_the_world_of_the_file_if_it_or_its_folder_is_given(scene, tmp_path):
+    """nerfstudio's world is that of the file by dataparser_transforms.json, without `applied_transform`."""
     applied = np.eye(4)[[1, 2, 0]]
     scene.write(tmp_path / "app", scene.document(applied_transform=applied.tolist()))
     frames = [{"camera_to_world": scene.opengl(index), "fov": 60.0} for index in range(3)]
@@ -262,7 +262,7 @@ def test_a_camera_path_is_in_the_world_of_the_file_whether_it_or_its_folder_is_n
 
 
 def test_a_camera_path_is_in_the_world_of_the_poses_of_an_archive(scene, tmp_path):
-    """The poses of the pictures as a path are the cameras of the pictures."""
+    """A path with the poses of the pictures has the cameras of the pictures."""
     poses = [scene.opengl(index) for index in range(len(scene.pictures))]
     np.savez(
         tmp_path / "ball.npz", images=np.stack(scene.pictures), cam_poses=np.array(poses), focal=scene.matrix[0, 0]
@@ -276,7 +276,7 @@ def test_a_camera_path_is_in_the_world_of_the_poses_of_an_archive(scene, tmp_pat
     torch.testing.assert_close(cameras.extrinsics, task.support.cameras.extrinsics, atol=1e-5, rtol=0)
 
 
-def test_what_a_reader_stumbles_over_is_one_line(tmp_path, monkeypatch):
+def test_any_error_of_a_reader_is_one_line(tmp_path, monkeypatch):
     def stumble(*_):
         raise KeyError("viewpoint")
 

@@ -1,4 +1,4 @@
-"""Source of truth: geometry by hand, and that turning the world and its cameras together changes no picture."""
+"""Source of truth: geometry by hand. Rotating the world and its cameras together changes no picture."""
 
 import json
 from dataclasses import replace
@@ -18,7 +18,7 @@ FLIP = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)  # OpenCV's cam
 
 
 def z_up_views(count=5):
-    """Cameras around a point off the origin, in a world with z up."""
+    """Cameras around a point that is not the origin, in a world with z up."""
     generator = torch.Generator().manual_seed(0)
     eyes = torch.randn(count, 3, generator=generator) * 2 + torch.tensor([0.0, 0.0, 6.0])
     pose = camera.look_at(eyes, (0.3, 0.2, 0.5), (0.0, 0.0, 1.0))
@@ -27,14 +27,14 @@ def z_up_views(count=5):
     return Views(images, camera.pinhole(lens, pose, 6, 8), bounds=Sphere((0.3, 0.2, 0.5), 1.5))
 
 
-def test_up_stays_up_and_lengths_and_handedness_stay():
+def test_the_matrix_to_y_up_is_a_rotation_that_maps_z_to_y():
     turn = y_up_from("z")
     assert (turn @ torch.tensor([0.0, 0, 1, 1], dtype=torch.float64)).tolist() == [0, 1, 0, 1]
     assert torch.equal(turn @ turn.T, torch.eye(4, dtype=torch.float64))
     assert float(torch.linalg.det(turn)) == 1
 
 
-def test_every_pixel_sees_the_turned_world_as_it_saw_the_world():
+def test_the_rays_of_all_pixels_are_rotated_with_the_world():
     before = z_up_views()
     after = upright(before, "z")
     turn = y_up_from("z")[:3, :3].float()
@@ -45,11 +45,11 @@ def test_every_pixel_sees_the_turned_world_as_it_saw_the_world():
         torch.testing.assert_close(torch.stack([new.near, new.far]), torch.stack([old.near, old.far]))
     assert after.images is before.images
     assert after.bounds.centre == pytest.approx((0.3, 0.5, -0.2))
-    # what the cameras call up in their pictures was z, and is y
+    # up in the pictures was z and is now y
     assert float(camera.camera_from_world(after.cameras)[:, 1, 1].mean()) < -0.5
 
 
-def test_y_up_is_left_alone_and_another_axis_is_refused():
+def test_y_up_changes_nothing_and_an_invalid_axis_is_refused():
     views = z_up_views()
     assert upright(views, "y") is views
     assert upright(replace(views, up="z"), "y").up == "y", "as the caller says, whatever the files say"
@@ -62,7 +62,7 @@ def test_y_up_is_left_alone_and_another_axis_is_refused():
 
 @pytest.mark.parametrize("up", ["y", "z", "x", "-y", "-z", "-x", "0.3,0.8,-0.5"])
 def test_up_is_guessed_from_level_cameras_and_becomes_y(up):
-    """Cameras that look at one place, held level in a world with that direction up; the turn is a rotation."""
+    """Cameras look at one place and are level in a world with that direction up. The matrix is a rotation."""
     x, y, z = axis = _direction(up).tolist()
     generator = torch.Generator().manual_seed(1)
     eyes = torch.nn.functional.normalize(torch.randn(12, 3, generator=generator), dim=-1) * 3
@@ -78,8 +78,8 @@ def test_up_is_guessed_from_level_cameras_and_becomes_y(up):
     assert float(torch.linalg.det(turn)) == pytest.approx(1)
 
 
-def test_up_is_not_guessed_where_cameras_do_not_tell():
-    """Cameras rolled at random about their axes: no direction is level for all of them."""
+def test_up_is_not_guessed_from_cameras_with_random_roll():
+    """With random rotations, there is no up for which all cameras are level."""
     generator = torch.Generator().manual_seed(2)
     rotation = torch.linalg.qr(torch.randn(20, 3, 3, generator=generator))[0]
     rotation = rotation * torch.linalg.det(rotation)[:, None, None]
@@ -88,8 +88,8 @@ def test_up_is_not_guessed_where_cameras_do_not_tell():
     assert guess_up(camera.pinhole(camera.symmetric_intrinsics(4, 4, 0.7), pose, 4, 4)) is None
 
 
-def test_scenes_are_read_upright_when_asked_for(tmp_path):
-    """Level cameras in a world with z up: what `upright` makes of the views as they are read."""
+def test_scenes_are_read_upright_if_requested(tmp_path):
+    """Level cameras in a world with z up. Source of truth: `upright` of the views as they are read."""
     eyes = torch.tensor([[3.0, 0.0, 1.0], [0.0, 3.0, 1.0], [-3.0, 0.0, 1.0], [0.0, -3.0, 1.0]])
     pose = camera.look_at(eyes, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)).double()
     frames = [
@@ -111,7 +111,7 @@ def test_scenes_are_read_upright_when_asked_for(tmp_path):
         read_task(tmp_path, up="w")
 
 
-def test_each_scene_of_a_folder_is_turned_as_its_file_says(scene, tmp_path):
+def test_each_scene_of_a_folder_is_rotated_by_its_own_up(scene, tmp_path):
     for name, up in (("a", "z"), ("b", "y")):
         scene.write(tmp_path / name, scene.document(up=up))
     data = open_dataset(tmp_path)

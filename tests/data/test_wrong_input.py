@@ -1,4 +1,4 @@
-"""Source of truth: files broken on purpose; a message says file, expected, found, what to do."""
+"""Source of truth: files damaged on purpose. A message has the file, what was expected and found, and a remedy."""
 
 import json
 import struct
@@ -29,7 +29,7 @@ def test_missing_and_empty_folders(tmp_path):
         refused(action, tmp_path, match="(an empty folder|neither)")
 
 
-def test_of_a_single_view_none_can_be_left_out(scene, tmp_path):
+def test_a_single_view_cannot_be_held_out(scene, tmp_path):
     one = type(scene)(views=1).write(tmp_path)
     refused(read_task, one, match="expected two views or more, found 1; add views, or use `render --all-views`")
     assert len(read_views(one)) == 1
@@ -97,7 +97,7 @@ def test_an_absurd_size_is_refused_before_decoding(scene, tmp_path, side, found)
         (lambda pose: None, "expected a 4 x 4 pose"),
     ],
 )
-def test_a_pose_that_is_none(scene, tmp_path, change, match):
+def test_an_invalid_pose(scene, tmp_path, change, match):
     document = scene.document()
     frame = document["frames"][4]
     frame["transform_matrix"] = change(frame["transform_matrix"])
@@ -120,7 +120,7 @@ def test_a_pose_that_is_none(scene, tmp_path, change, match):
         ({"train_filenames": ["a"], "test_filenames": [1]}, "expected names of files in train_filenames"),
     ],
 )
-def test_a_calibration_that_is_none(scene, tmp_path, fields, match):
+def test_an_invalid_calibration(scene, tmp_path, fields, match):
     refused(read_task, scene.write(tmp_path, scene.document(**fields)), match=match)
 
 
@@ -191,7 +191,7 @@ def test_archives_of_one_name_are_refused_and_those_of_no_split_are_named(tmp_pa
         read_views(other / "8_b.npz", downscale=0)
 
 
-def test_channels_that_were_not_generated(tmp_path):
+def test_missing_channels(tmp_path):
     refused(read_channel, tmp_path, "depth", match=r"depth\.npz: expected the depth of the object, found nothing")
     np.savez(tmp_path / "depth.npz", depth=np.zeros((2, 3)))
     refused(read_channel, tmp_path, "depth", match=r"found float64 \(2, 3\)")

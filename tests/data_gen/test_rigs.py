@@ -1,4 +1,4 @@
-"""Source of truth: Kornia's projection, the stated spread of cameras, hand-made numbers, and what is refused."""
+"""Source of truth: Kornia's projection, the stated distribution of cameras, numbers by hand, and error messages."""
 
 import math
 from dataclasses import replace
@@ -55,16 +55,16 @@ def test_convention_origin_at_principal_point_and_up_is_up(rig):
 
 @pytest.mark.parametrize("distance", [1.5, 3.0, 8.0])
 def test_unit_sphere_fits_with_a_margin(distance):
-    # The silhouette of the unit sphere is the cone of half angle asin(1 / distance) around the axis.
+    # The silhouette of the unit sphere is a cone around the axis, with a half angle of asin(1 / distance).
     rig = rigs.fixed(1, 40, distance=distance)
     radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(1.0 / distance))
     assert 0.90 * 20 < radius < 0.97 * 20
 
 
 def test_the_spiral_of_srn():
-    """The renderings of SRN's test cars: 251 views 1.3 from cars of radius 1/2, 131.25 pixels of focal length.
+    """SRN's test cars have 251 views at a distance of 1.3 from cars of radius 1/2, and a focal length of 131.25 pixels.
 
-    Its renderer steps i from 20 by 20/250 and puts cameras pi i / 40 from the pole below, at the azimuth i.
+    Its renderer increases i from 20 by 20/250. Cameras are at the azimuth i, and pi i / 40 from the lower pole.
     """
     preset = rigs.RIG_PRESETS["srn"]
     rig = rigs.make_rig("srn", 251, 128, distance=preset.distance, field_of_view=preset.field_of_view)
@@ -73,15 +73,15 @@ def test_the_spiral_of_srn():
     np.testing.assert_allclose(np.linalg.norm(rig.world_from_camera[:, :3, 3], axis=1) / 2, 1.3)
     steps = np.arange(251) * 20 / 250
     np.testing.assert_allclose(y, 1.3 * np.sin(np.pi * steps / 40), atol=1e-12)
-    turned = np.unwrap(np.arctan2(x, z)[:-1])  # the last one stands at the pole
+    turned = np.unwrap(np.arctan2(x, z)[:-1])  # the last camera is at the pole
     np.testing.assert_allclose(turned - turned[0], -steps[:-1], atol=1e-9)
 
 
-def test_fixed_is_the_same_every_time_and_spread():
+def test_the_fixed_rig_is_always_the_same_and_evenly_distributed():
     rig, again = rigs.fixed(50, 32), rigs.fixed(50, 32)
     assert np.array_equal(rig.world_from_camera, again.world_from_camera)
     directions = rig.world_from_camera[:, :3, 3] / 3.0
-    # Caps of 15 degrees around 50 points, and of 29 around 25, cover about the same share of the band.
+    # Caps of 15 degrees around 50 points cover about the same share of the band as caps of 29 degrees around 25.
     assert _nearest(directions).min() > 15.0
     assert _nearest(directions[0::2]).min() > 29.0
     assert _nearest(directions[1::2]).min() > 29.0
@@ -90,19 +90,19 @@ def test_fixed_is_the_same_every_time_and_spread():
     assert 70.0 < elevations.max() < 80.0
 
 
-def test_fixed_first_views_of_each_half_are_far_apart():
+def test_the_first_views_of_each_half_of_the_fixed_rig_are_far_apart():
     directions = rigs.fixed(50, 32).world_from_camera[:, :3, 3] / 3.0
     assert _nearest(directions[0:10:2]).min() > 60.0
     assert _nearest(directions[1:11:2]).min() > 60.0
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 50, 51])
-def test_fixed_any_number_of_views(views):
+def test_the_fixed_rig_has_any_number_of_views(views):
     centres = rigs.fixed(views, 16).world_from_camera[:, :3, 3]
     assert len(np.unique(centres.round(6), axis=0)) == views
 
 
-def test_random_rigs_follow_their_seed_and_cover_their_part_of_the_sphere():
+def test_random_rigs_depend_on_their_seed_and_cover_their_part_of_the_sphere():
     one = rigs.random(400, 8, seed=3).world_from_camera[:, :3, 3]
     assert np.array_equal(one, rigs.random(400, 8, seed=3).world_from_camera[:, :3, 3])
     assert not np.array_equal(one, rigs.random(400, 8, seed=4).world_from_camera[:, :3, 3])
@@ -120,9 +120,9 @@ def test_presets():
     small, large = (
         [make_rig(name, 50, 16, seed=seed).world_from_camera for seed in (5, 6)] for name in ("paper-128", "paper-200")
     )
-    assert {preset.distance for preset in papers} == {4.0}  # near 2 and far 6 of both loaders
+    assert {preset.distance for preset in papers} == {4.0}  # both loaders have near 2 and far 6
     focal = 100 / np.tan(np.radians(RIG_PRESETS["paper-200"].field_of_view) / 2)
-    assert focal == pytest.approx(277.77, abs=0.01)  # of the authors' loader
+    assert focal == pytest.approx(277.77, abs=0.01)  # as in the authors' loader
     assert not np.array_equal(*small)
     assert np.array_equal(*large)
     with pytest.raises(ValueError, match="paper-128, paper-200, srn, got 'paper-64'"):
@@ -139,7 +139,7 @@ def test_poses_are_those_of_the_cameras_of_hyperplanes():
     assert np.allclose(camera.centres(part).numpy(), rig.world_from_camera[[4, 0], :3, 3], atol=1e-12)
 
 
-def test_straight_above_and_below_the_origin_the_image_top_is_the_same_axis():
+def test_above_and_below_the_origin_the_top_of_the_image_is_the_same_axis():
     centres = np.array([[0.0, 3.0, 0.0], [0.0, -2.0, 0.0], [1e-7, 3.0, 0.0], [1e-5, 3.0, 0.0], [0.0, 1.0, 2.0]])
     expected = torch.linalg.inv(look_at(torch.from_numpy(centres)))
     np.testing.assert_allclose(rigs.look_at_origin(centres), expected, atol=1e-9)
@@ -170,6 +170,6 @@ def test_one_intrinsic_matrix_serves_all_views():
         (lambda: Rig(np.eye(4)[None], np.eye(3), 4, 4, 2, 2), "received 2 and 2"),
     ],
 )
-def test_wrong_input_says_what_was_received(call, message):
+def test_wrong_input_is_named_in_the_error(call, message):
     with pytest.raises(ValueError, match=message):
         call()

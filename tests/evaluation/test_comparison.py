@@ -1,4 +1,4 @@
-"""Source of truth: scipy's paired t-test, and arithmetic by hand."""
+"""Sources of truth: SciPy's paired t-test, and arithmetic by hand."""
 
 import math
 
@@ -15,24 +15,24 @@ def score(method, values, **numbers):
 
 
 def test_the_paired_test_is_that_of_scipy():
-    from scipy.stats import t, ttest_rel  # here: it takes 0.6 s of each process that looks for tests
+    from scipy.stats import t, ttest_rel  # imported here, because it takes 0.6 s in each process that collects tests
 
     first, second = [20.0, 25.5, 31.0, 28.0], [19.0, 25.0, 28.5, 27.9]
     found = compare(score("a", first), score("b", second))
     assert found.p == pytest.approx(ttest_rel(first, second).pvalue)
     differences = np.subtract(first, second)
-    half = t.ppf(0.975, 3) * differences.std(ddof=1) / 2  # the root of four objects
+    half = t.ppf(0.975, 3) * differences.std(ddof=1) / 2  # divided by the square root of four objects
     assert (found.low, found.high) == pytest.approx((differences.mean() - half, differences.mean() + half))
     assert found.differences == pytest.approx({"o0": 1.0, "o1": 0.5, "o2": 2.5, "o3": 0.1})
 
 
 @pytest.mark.parametrize(("shift", "p"), [(0.0, 1.0), (0.5, 0.0)])
-def test_differences_that_are_all_alike(shift, p):
+def test_equal_differences_have_an_interval_of_width_zero(shift, p):
     found = compare(score("a", [20.0 + shift, 30.0 + shift]), score("b", [20.0, 30.0]))
     assert (found.low, found.high, found.p) == (shift, shift, p)
 
 
-def test_one_object_says_nothing_about_others():
+def test_one_object_has_no_interval():
     found = compare(score("a", [20.0]), score("b", [19.0]))
     assert (found.mean, found.low, found.p) == (1.0, None, None)
 
@@ -44,7 +44,7 @@ def test_only_the_same_objects_can_be_compared():
         compare(score("a", [1.0, math.inf]), score("b", [1.0, 2.0]))
 
 
-def test_every_pair_the_better_method_first():
+def test_pairs_have_the_better_method_first():
     pairs = compare_all([score("low", [10.0, 12.0]), score("high", [20.0, 21.0]), score("perfect", [math.inf, 9.0])])
     assert [(pair.first, pair.second, pair.mean) for pair in pairs] == [("high", "low", 9.5)]
 
@@ -54,7 +54,7 @@ def test_seeds_are_averaged_object_by_object():
     assert [each.psnr for each in merged.objects] == [21.0, 32.0]
     assert merged.objects[0].psnr_foreground is None  # one of the seeds has none
     assert merged.mean("psnr") == 26.5
-    assert merged.deviation("psnr") == pytest.approx(3 / 2**0.5)  # of 25 and 28
+    assert merged.deviation("psnr") == pytest.approx(3 / 2**0.5)  # the means of the seeds are 25 and 28
     assert merged.spread("psnr") == pytest.approx(5.5)
     assert merge_seeds([score("a", [20.0])]).deviation("psnr") is None
     with pytest.raises(ValueError, match="expected the same objects for every seed"):

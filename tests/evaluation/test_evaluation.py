@@ -1,4 +1,4 @@
-"""Source of truth: a constant error, whose PSNR is -20 log10 of it, and means by hand."""
+"""Sources of truth: a constant error e, whose PSNR is -20 log10 e, and means by hand."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from tests.reference_rendering import Balls, awaken, ball_views, ring, small_mod
 
 
 class Shifted:
-    """A method that knows the answer and adds a constant to it."""
+    """A method that returns the true images with a constant error."""
 
     def __init__(self, data, error):
         self.data, self.error, self.number = data, error, 0
@@ -41,7 +41,7 @@ class Answer:
 
 
 def test_a_constant_error_scores_as_calculated():
-    # an error of 0.1 in every number of every image: 20 dB
+    # an error of 0.1 in all values has a PSNR of 20 dB
     data = Balls(test=3)
     score = evaluate("shifted", Shifted(data, 0.1), data, data.names("test"))
     assert [each.name for each in score.objects] == data.names("test")
@@ -63,7 +63,7 @@ def test_scores_are_means_over_the_query_views():
 
 
 class Glass(Balls):
-    """Objects of which the second has masks that never count as foreground."""
+    """Objects of which the second has masks with opacity 0.4, which is not foreground."""
 
     def task(self, name):
         task = super().task(name)
@@ -71,7 +71,7 @@ class Glass(Balls):
         return replace(task, query=replace(task.query, masks=masks))
 
 
-def test_an_object_without_foreground_has_no_quality_there_and_the_others_keep_theirs():
+def test_an_object_without_foreground_has_no_foreground_psnr():
     data = Glass(test=2)
     score = evaluate("nearest_view", NearestView(), data, ["test0", "test1"])
     assert score.objects[1].psnr_foreground is None
@@ -87,14 +87,14 @@ def test_pictures_are_clamped_before_they_are_compared():
     class Overshooting(Shifted):
         def adapt(self, support):
             answer = super().adapt(support)
-            answer.images = torch.where(answer.images >= 1, 3.0, answer.images)  # clamped to white, which is right
+            answer.images = torch.where(answer.images >= 1, 3.0, answer.images)  # correct after clamping
             answer.error = 0.0
             return answer
 
     assert evaluate("over", Overshooting(data, 0.0), data, ["test0"]).objects[0].psnr == float("inf")
 
 
-def test_every_object_is_shown_to_the_caller():
+def test_the_callback_is_called_for_every_object():
     data, seen = Balls(test=2), []
     evaluate("nearest_view", NearestView(), data, data.names("test"), lambda *shown: seen.append(shown))
     assert [score.name for score, _, _, _ in seen] == [task.name for _, task, _, _ in seen] == data.names("test")
@@ -115,13 +115,13 @@ def test_a_row_in_json():
     }
 
 
-def test_nothing_to_evaluate_on_is_refused():
+def test_evaluating_on_no_objects_is_refused():
     with pytest.raises(ValueError, match="names: expected at least one object to evaluate on, got none"):
         evaluate("nearest_view", NearestView(), Balls(), [])
 
 
 @pytest.mark.parametrize("broken", ["query", "masks"])
-def test_an_object_that_cannot_be_judged_is_named(broken):
+def test_an_object_that_cannot_be_evaluated_is_named(broken):
     class Broken(Balls):
         def task(self, name):
             task = super().task(name)
@@ -149,7 +149,7 @@ def test_pictures_are_compared_in_the_precision_of_the_data():
 
 
 def test_seeds_of_a_perfect_row_have_no_deviation():
-    """A query view that is a support view is copied: infinite PSNR by every seed."""
+    """A query view that is also a support view is copied, with infinite PSNR for all seeds."""
     seed = Score("nearest_view", (ObjectScore("one", math.inf, 1.0, 0.0, 0.0, math.inf),))
     row = replace(seed, seeds=(seed, seed))
     assert row.deviation("psnr") is None
@@ -161,7 +161,7 @@ def headings_and_rows(row):
     return " ".join(cell for line in rows([row]) for cell in line)
 
 
-def test_an_object_that_one_method_failed_on_is_left_out_of_the_pictures(tmp_path):
+def test_the_grid_omits_objects_on_which_a_method_failed(tmp_path):
     data, grid = Balls(test=2), PictureGrid()
     one, two = (data.task(name) for name in data.names("test"))
     for method, tasks in (("a", (one, two)), ("b", (two,))):
@@ -172,14 +172,14 @@ def test_an_object_that_one_method_failed_on_is_left_out_of_the_pictures(tmp_pat
     assert two.name in text
     assert one.name not in text
     grid.add("c", 0, one, Pictures(one.query.images, one.query.masks, one.query.masks, 0))
-    grid.save(tmp_path / "grid.svg")  # no object that all three have
+    grid.save(tmp_path / "grid.svg")  # there is no object that all three methods have
     text = (tmp_path / "grid.svg").read_text()
     assert one.name in text
     assert two.name in text
 
 
-def test_asking_whether_views_suit_changes_no_model_in_training():
-    """Running statistics of codes follow the objects of the training alone."""
+def test_checking_the_suitability_of_views_does_not_change_a_model():
+    """Only training changes the running statistics of codes."""
     model = awaken(small_model()).train()
     before = {name: value.clone() for name, value in model.state_dict().items()}
     suitability_warnings(model, ball_views(ring(4, (12, 12))))
@@ -189,8 +189,8 @@ def test_asking_whether_views_suit_changes_no_model_in_training():
 
 
 @pytest.mark.parametrize(("steps", "count", "advised"), [(0, 4, True), (0, 1, False), (5, 4, False), (None, 4, False)])
-def test_steps_are_advised_where_they_can_be_taken(steps, count, advised):
-    """A baked file, whose steps are None, refuses `--steps`, and so does a model of any number of views with one."""
+def test_steps_are_suggested_only_if_they_are_possible(steps, count, advised):
+    """`--steps` is refused with a baked file (steps is None) and with a single view."""
     views = ball_views(ring(4, (12, 12)))[:count]
     views = replace(views, masks=torch.zeros(count, 1, 12, 12))
     (line,) = worse_than_copying(views, 10.0, 12.0, steps)

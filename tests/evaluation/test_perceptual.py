@@ -1,6 +1,6 @@
-"""Source of truth: AlexNet as torchvision builds it, and the formula of Zhang et al. written out on its features.
+"""Source of truth: AlexNet as in torchvision, and the formula of Zhang et al. on its features.
 
-The `lpips` package gave the same numbers with the same random weights, to all digits, when this was written.
+The `lpips` package gave exactly the same numbers with the same random weights when this was written.
 """
 
 import pytest
@@ -47,7 +47,7 @@ def reference(network, state, first, second):
     return total
 
 
-def test_the_formula_of_the_paper(weights):
+def test_lpips_agrees_with_its_formula(weights):
     path, network, state = weights
     first, second = torch.rand(2, 2, 3, 40, 33, generator=torch.Generator().manual_seed(1))
     found = LPIPS(path)(first, second)
@@ -57,7 +57,7 @@ def test_the_formula_of_the_paper(weights):
     assert LPIPS(path)(first, first).tolist() == [0.0, 0.0]
 
 
-def test_what_cannot_be_used_is_named(weights, tmp_path):
+def test_small_images_and_incomplete_weights_are_refused(weights, tmp_path):
     path, _, state = weights
     with pytest.raises(ValueError, match="expected at least 32 x 32 pixels for LPIPS, got 16 x 40"):
         LPIPS(path)(torch.rand(1, 3, 16, 40), torch.rand(1, 3, 16, 40))

@@ -1,4 +1,4 @@
-"""Source of truth: the LaTeX source of the paper, typed into the tests a second time as sums, and properties."""
+"""Sources of truth: the LaTeX source of the paper, from which sums of columns are typed here, and properties."""
 
 import csv
 import io
@@ -32,7 +32,7 @@ def test_the_numbers_of_the_paper():
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=EXPERIMENTS)
-def test_every_cell_can_be_run_and_every_published_number_has_one(experiment):
+def test_every_cell_can_be_run_and_every_published_number_has_a_cell(experiment):
     cells = {(cell.row, cell.column) for cell in experiment.cells}
     assert len(cells) == len(experiment.cells)
     for cell in experiment.cells:
@@ -41,7 +41,7 @@ def test_every_cell_can_be_run_and_every_published_number_has_one(experiment):
         assert cell.trained.method in TRAINABLE
     if experiment.published is not None:
         shown = {(row, column): experiment.published_value(row, column) for row, column in cells}
-        named = {experiment.published_rows.get(row, row): row for row in experiment.rows}  # in the order of the paper:
+        named = {experiment.published_rows.get(row, row): row for row in experiment.rows}  # in the order of the paper
         assert [row for row in named if row in experiment.published.rows] == list(experiment.published.rows)
         for row, numbers in experiment.published.rows.items():
             found = [shown[named[row], column] for column in experiment.published.columns]
@@ -52,8 +52,8 @@ def test_every_cell_can_be_run_and_every_published_number_has_one(experiment):
         )
 
 
-def test_the_numbers_of_tancik_et_al_stand_beside_one_view_and_those_of_hyperplanes_beside_25():
-    # their notebook judges by one view, the paper shows HyperPlanes 25; four numbers of tab:shapenet, typed again
+def test_published_numbers_are_shown_for_their_number_of_views():
+    # the notebook of Tancik et al. uses 1 support view, HyperPlanes 25; four numbers of tab:shapenet, typed again
     shapenet = EXPERIMENTS["shapenet"]
     assert shapenet.published_value("Standard, 1 view", "Cars") == 11.45
     assert shapenet.published_value("MV Meta, 1 view", "Chairs") == 18.85
@@ -65,7 +65,7 @@ def test_the_numbers_of_tancik_et_al_stand_beside_one_view_and_those_of_hyperpla
         assert cell.row.endswith(f", {cell.views} view{'s' if cell.views > 1 else ''}")
 
 
-def test_all_rows_of_a_column_are_judged_on_the_same_objects_and_views():
+def test_all_rows_of_a_column_use_the_same_objects():
     for experiment in EXPERIMENTS.values():
         for part in ("Train", "Test", ""):
             for column in experiment.columns:
@@ -79,7 +79,7 @@ def test_all_rows_of_a_column_are_judged_on_the_same_objects_and_views():
     }
 
 
-APPENDIX_B = {  # typed from the LaTeX source: the entries of both sizes, then those of each
+APPENDIX_B = {  # from the LaTeX source: the entries of both sizes, then those of each size
     0: {
         "model.network.depth": 8,
         "model.network.width": 256,
@@ -110,7 +110,7 @@ def entry(value, name):
 
 
 @pytest.mark.parametrize(("name", "size"), [("shapenet", 128), ("cross-class", 200)])
-def test_the_scale_of_the_paper_is_the_paper(name, size):
+def test_the_scale_of_the_paper_has_the_settings_of_the_paper(name, size):
     experiment, scale = EXPERIMENTS[name], SCALES["paper"]
     assert experiment.size == size
     trained = next(each for each in experiment.trainings if each.method == "hyperplanes" and not each.packaged)
@@ -136,21 +136,21 @@ def test_every_scale_configures_every_model(scale):
             assert made.training.steps > 0
 
 
-def test_what_is_not_as_the_paper_says_is_known():
-    # Eq. 7 reads theta, the presets of the paper the weights of the updated layers: docs/paper.md
+def test_differences_from_the_paper_are_only_the_known_ones():
+    # in Eq. 7 the hypernetwork reads theta; with the presets it reads the weights of the updated layers (docs/paper.md)
     for experiment in EXPERIMENTS.values():
         found = {
             each.entry for each in differences(experiment, SCALES["paper"]) if each.sources[0] not in ("-", each.here)
         }
         assert found <= {"model.hypernetwork.weights_seen"}, experiment.name
-    # and of learnit's, the rate of Adam, of which there are two
+    # in learnit, the rate of Adam, of which there are two
     learned = [each for each in differences(EXPERIMENTS["shapenet"], SCALES["paper"]) if each.sources[2] != "-"]
     assert [each.entry for each in learned] == ["training.learning_rate"]
     assert len(differences(EXPERIMENTS["shapenet"], SCALES["small"])) > 20
 
 
 def test_learned_initialisations_at_the_scale_of_the_paper_are_those_of_tancik_et_al():
-    # tancik/learnit, Experiments/shapenet.ipynb: typed again
+    # from tancik/learnit, Experiments/shapenet.ipynb
     experiment = EXPERIMENTS["shapenet"]
     trained = next(each for each in experiment.trainings if each.method == "mv_meta")
     made = configuration(experiment, trained, SCALES["paper"], objects=700, seed=0)
@@ -167,7 +167,7 @@ def test_learned_initialisations_at_the_scale_of_the_paper_are_those_of_tancik_e
 
 
 def test_fine_tuning_at_the_scale_of_the_paper_is_that_of_the_authors_and_of_nerf():
-    # run_hyperplanes_new_eval.py: Adam at 1e-4 for every step; NeRF, section 5.3: 5e-4 that falls to 5e-5
+    # run_hyperplanes_new_eval.py: Adam with rate 1e-4; NeRF, section 5.3: the rate decreases from 5e-4 to 5e-5
     scale = SCALES["paper"]
     tuning, scratch = scale.fine_tuning, scale.scratch
     assert (tuning.trainable, tuning.rays, tuning.optimiser, tuning.learning_rate) == (
@@ -182,7 +182,7 @@ def test_fine_tuning_at_the_scale_of_the_paper_is_that_of_the_authors_and_of_ner
     assert rates == pytest.approx([5e-4, 5e-4 * 0.1**0.5, 5e-5])
 
 
-def test_changes_reach_the_entry_they_name_and_nothing_else():
+def test_changes_apply_only_to_the_named_entry():
     before = preset("quick")
     after = change(before, {"model.hypernetwork.views": 3, "training.rays": 7})
     assert (after.model.hypernetwork.views, after.training.rays) == (3, 7)
@@ -218,7 +218,7 @@ def test_the_ablations_change_what_they_name():
     ]
 
 
-def test_some_rows_and_columns_of_a_table():
+def test_selecting_rows_and_columns_of_a_table():
     shapenet = EXPERIMENTS["shapenet"]
     assert shapenet.of(()) == shapenet
     one = shapenet.of(["Cars", "Standard, 1 view", "MV Meta, 1 view"])
@@ -230,7 +230,7 @@ def test_some_rows_and_columns_of_a_table():
         SCALES["smoke"].applied(EXPERIMENTS["iterations"]).of(["Cars: HyperPlanes", "3"])
 
 
-def test_scales_make_things_smaller_and_say_so():
+def test_sizes_of_the_scales():
     smoke, small, paper = SCALES["smoke"], SCALES["small"], SCALES["paper"]
     assert [scale.method("hyperplanes_100") for scale in (smoke, small)] == ["hyperplanes_2", "hyperplanes_100"]
     assert [scale.planes(25) for scale in (smoke, small, paper)] == [4, 25, 25]
@@ -243,21 +243,21 @@ def test_scales_make_things_smaller_and_say_so():
     assert {c.method for c in smoke.applied(iterations).cells} == {"hyperplanes", "nerf_scratch_3"}
     assert paper.applied(iterations) == iterations
     assert [small.seeds(EXPERIMENTS[name]) for name in ("shapenet", "cross-class", "target")] == [3, 3, 3]
-    # "averaged over 3 runs", "over 5 runs"; tab:shapenet and tab:time do not say over how many
+    # "averaged over 3 runs", "over 5 runs"; tab:shapenet and tab:time do not state the number of runs
     stated = {name: each.runs for name, each in EXPERIMENTS.items() if each.runs != 5}
     assert stated == {"shapenet": None, "time": None, "iterations": 3}
     assert [paper.seeds(EXPERIMENTS[name]) for name in ("cross-class", "iterations", "time")] == [5, 3, 1]
 
 
 def outcome_of(experiment, seeds, **about):
-    """An outcome with two objects in each cell, so many seeds, and one where the model is packaged."""
+    """An outcome with two objects in each cell, and `seeds` seeds, or one for packaged models."""
     row = Score("", (ObjectScore("a", 20.0, 0.9, 1.0, 1.0, 19.0), ObjectScore("b", 22.0, 0.9, 1.0, 1.0, 21.0)))
     scores = {(c.row, c.column): row if c.trained.packaged else merge_seeds([row] * seeds) for c in experiment.cells}
     return Outcome(experiment, SCALES["small"], scores, {}, seeds, **about)
 
 
-def test_a_table_of_packaged_models_on_given_data_says_so():
-    """By hand: nothing was generated or trained, and two objects were evaluated once, of the scale's ten."""
+def test_a_table_of_packaged_models_on_given_data_states_this():
+    """By hand: nothing is generated or trained, and two of the ten objects of the scale are evaluated once."""
     packaged = EXPERIMENTS["shapenet"].of(["small, 1 view", "Cars"])
     outcome = outcome_of(packaged, 1, objects={}, given=["car"])
     assert report.what_differs(outcome)[:3] == [
@@ -268,8 +268,8 @@ def test_a_table_of_packaged_models_on_given_data_says_so():
     assert "states another value" not in report.as_markdown(outcome, "")
 
 
-def test_of_how_many_objects_and_runs_the_paper_speaks():
-    """Source of truth: its words; "two objects from the car and chair classes", and "averaged over 3 runs"."""
+def test_numbers_of_objects_and_runs_of_the_paper_are_stated():
+    """Source of truth: the paper: "two objects from the car and chair classes", and "averaged over 3 runs"."""
     names = "iterations", "target"
     found = {name: report.what_differs(outcome_of(EXPERIMENTS[name], 3, objects={})) for name in names}
     judged = {name: [line for line in lines if line.startswith("Evaluated on")] for name, lines in found.items()}
@@ -277,7 +277,7 @@ def test_of_how_many_objects_and_runs_the_paper_speaks():
     assert [line.rpartition(". ")[2] for line in found["iterations"] if line.startswith("Seeds")] == ["Paper: 3."]
 
 
-def test_a_table_says_what_was_trained_on_what_and_how_often():
+def test_a_table_states_data_training_and_seeds():
     both = EXPERIMENTS["shapenet"].of(["small, 1 view", "HyperPlanes, 1 view", "Cars", "Chairs"])
     outcome = outcome_of(both, 3, objects={"car": 40, "chair": 7}, given=["chair"])
     data, training, _, seeds, *_ = report.what_differs(outcome)

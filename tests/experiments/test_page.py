@@ -1,4 +1,4 @@
-"""Source of truth: the page itself: parsed as HTML, its pictures decoded and compared with what went in."""
+"""Source of truth: the page, parsed as HTML, and its decoded pictures, compared with the inputs."""
 
 import base64
 import io
@@ -48,14 +48,14 @@ class Balance(HTMLParser):
             self.open.append(tag)
 
     def handle_startendtag(self, tag, attrs):
-        """Nothing stays open."""
+        """Such a tag is closed already."""
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
 
 class NamedBalls(Balls):
-    """Balls whose views are files, in one split."""
+    """Balls whose views have file names, in one split."""
 
     def names(self, split):
         return super().names("test")
@@ -103,7 +103,7 @@ def checked(page):
     return parser
 
 
-def test_the_page_is_whole_and_needs_nothing_else():
+def test_the_page_is_valid_and_loads_no_other_files():
     page = whole_page()
     parser = checked(page)
     assert all(source.startswith("data:image/") for source in parser.sources)
@@ -111,7 +111,7 @@ def test_the_page_is_whole_and_needs_nothing_else():
     assert "A &lt;title&gt; &amp; more" in page
 
 
-def test_its_pictures_are_those_that_went_in():
+def test_the_pictures_of_the_page_are_the_inputs():
     content = report()
     found = [
         np.asarray(Image.open(io.BytesIO(base64.b64decode(source.partition(",")[2]))))
@@ -123,13 +123,13 @@ def test_its_pictures_are_those_that_went_in():
     np.testing.assert_array_equal(found[4], exhibit.views[0].truth)
 
 
-def test_a_method_that_no_exhibit_shows():
+def test_a_method_without_pictures_is_refused():
     content = report()
     with pytest.raises(ValueError, match="expected exhibits that show other"):
         render_page(Report(**{**vars(content), "method": "other"}))
 
 
-def test_errors_are_on_the_scale():
+def test_colours_of_errors_are_on_the_scale():
     truth = np.zeros((1, 3, 3), np.uint8)
     prediction = np.array([[[0] * 3, [round(255 * ERROR_SCALE)] * 3, [255] * 3]], np.uint8)
     seen = error_map(prediction, truth)
@@ -140,7 +140,7 @@ def test_errors_are_on_the_scale():
         error_map(prediction, truth[:, :2])
 
 
-def test_the_scale_never_turns_back():
+def test_the_lightness_of_the_scale_is_monotonic():
     lightness = colour_scale(np.linspace(0, 1, 100)) @ np.array([0.299, 0.587, 0.114])
     assert (np.diff(lightness) < 0).all()
 
@@ -151,11 +151,11 @@ def drawn(source):
     return ElementTree.fromstring(base64.b64decode(content))
 
 
-def test_a_line_goes_where_its_points_are():
+def test_a_line_of_a_chart_goes_through_its_points():
     root = drawn(line_chart({"first": [(0, 1.0), (50, 3.0), (100, 2.0)], "none": []}, "dB"))
     lines = [each for each in root.iter("{http://www.w3.org/2000/svg}path") if "#b4450e" in each.get("style", "")]
     found = [re.findall(r"[ML] (\S+) (\S+)", line.get("d")) for line in lines]
-    points = max(found, key=lambda each: float(each[-1][0]) - float(each[0][0]))  # the other is the legend's
+    points = max(found, key=lambda each: float(each[-1][0]) - float(each[0][0]))  # the other line is in the legend
     (x0, y0), (x1, y1), (x2, y2) = (tuple(map(float, pair)) for pair in points)
     assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2)
     assert y1 < y2 < y0
@@ -166,7 +166,7 @@ def test_a_line_goes_where_its_points_are():
     assert line_chart({"a": []}, "dB") == ""
 
 
-def test_counts_of_steps_have_a_tick_each():
+def test_each_number_of_steps_has_a_tick():
     root = drawn(line_chart({"a": [(0, 1.0), (1, 3.0), (300, 2.0)]}, "dB", counts=True))
     words = [each.text for each in root.iter("{http://www.w3.org/2000/svg}text")]
     assert [word for word in words if word.isdigit()][:3] == ["0", "1", "300"]
@@ -192,11 +192,11 @@ def test_the_page_of_a_demonstration():
     assert find_commit() in page
 
 
-def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp_path, monkeypatch):
+def test_the_first_page_uses_the_packaged_model_even_if_a_folder_has_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small").mkdir()
     with pytest.raises(CheckpointError, match="small"):
-        HyperPlanes.from_pretrained("small")  # a folder of that name goes first, where a name is given
+        HyperPlanes.from_pretrained("small")  # for a given name, a folder of that name has precedence
     shown, balls = [], NamedBalls(train=0, test=1, views=6, size=(24, 24))
     monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: balls)
     monkeypatch.setattr(DataSets, "folder", lambda data, class_name: tmp_path)
@@ -219,8 +219,8 @@ def test_the_first_page_is_by_the_packaged_model_whatever_lies_in_the_folder(tmp
     assert np.abs(read.astype(int) - found).max() <= 1
 
 
-def test_the_first_page_is_made_anew_when_the_mesh_files_change(tmp_path, monkeypatch):
-    """Property: a mesh that is added is noticed, what the demonstration itself writes beside them is not."""
+def test_the_first_page_is_made_again_when_the_mesh_files_change(tmp_path, monkeypatch):
+    """Property: an added mesh changes the result; files that the demonstration itself writes there do not."""
     made, cpu = [], torch.device("cpu")
     monkeypatch.setattr(Demonstration, "_show_packaged", lambda self, page: made.append(page.write_bytes(b"")))
     out = tmp_path / "out"

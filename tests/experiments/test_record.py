@@ -1,4 +1,4 @@
-"""Source of truth: what was begun, interrupted and finished; files that are there and that are gone."""
+"""Source of truth: stages that are started, interrupted and finished here, with existing and missing files."""
 
 import json
 import threading
@@ -20,7 +20,7 @@ from hyperplanes.utilities.checkpoints import CheckpointError
 from tests.reference_rendering import Balls
 
 
-def test_what_was_interrupted_goes_on_and_what_has_other_settings_begins_anew(tmp_path):
+def test_an_interrupted_stage_continues_and_one_with_other_settings_starts_again(tmp_path):
     made = tmp_path / "made"
 
     def interrupted():
@@ -49,8 +49,8 @@ def test_a_damaged_record_is_one_line(tmp_path):
         Record(tmp_path / "stages.json")
 
 
-def test_a_training_in_a_folder_of_its_own_is_made_anew_when_its_data_changes(tmp_path, monkeypatch):
-    """The folder has the same name, the model and the objects too: the data alone has other pixels."""
+def test_a_training_in_a_named_folder_is_made_again_when_its_data_changes(tmp_path, monkeypatch):
+    """The names of folder, model and objects stay the same; only the resolution of the data changes."""
     monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
     settings, trained = DemoSettings.quick_check(), []
 
@@ -75,8 +75,8 @@ def test_a_training_in_a_folder_of_its_own_is_made_anew_when_its_data_changes(tm
     assert len(trained) == 4
 
 
-def test_results_of_a_given_data_set_are_those_of_what_it_holds(tmp_path, monkeypatch):
-    """Property: with other content under the same path, trainings and evaluations have other names."""
+def test_names_of_results_depend_on_the_content_of_a_given_data_set(tmp_path, monkeypatch):
+    """Property: with other content at the same path, data and trainings have other names."""
     monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
     cars, table, cpu = tmp_path / "cars", DemoSettings.quick_check().table, torch.device("cpu")
     cars.mkdir()
@@ -93,8 +93,8 @@ def test_results_of_a_given_data_set_are_those_of_what_it_holds(tmp_path, monkey
     assert all(now != then for now, then in zip(names(), before, strict=True))
 
 
-def test_legacy_is_of_the_data_sets_that_are_given_wherever_they_lie(tmp_path, monkeypatch):
-    """By hand: a given one inside the workspace, a generated one, and one whose folder a worker is told."""
+def test_legacy_applies_only_to_given_data_sets(tmp_path, monkeypatch):
+    """A given data set inside the workspace and a generated one, in the main process and in a worker."""
     read, cpu = {}, torch.device("cpu")
     monkeypatch.setattr(data_sets, "open_dataset", lambda path, legacy: read.setdefault(path.name, legacy) or Balls())
     scale, given = DemoSettings.quick_check().scale, {"car": tmp_path / "data" / "cars"}
@@ -114,8 +114,8 @@ def test_legacy_is_of_the_data_sets_that_are_given_wherever_they_lie(tmp_path, m
     assert list(read.values()) == [True, False]
 
 
-def test_seconds_are_not_those_that_another_cell_has_found(tmp_path, monkeypatch):
-    """Property: PSNR and seconds of one evaluation have two files, and seconds one for each number of threads."""
+def test_seconds_are_stored_separately_for_each_number_of_threads(tmp_path, monkeypatch):
+    """Property: PSNR and seconds of an evaluation have separate files; seconds have one per number of threads."""
     monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
     cpu, psnr = torch.device("cpu"), replace(DemoSettings.quick_check().packaged.cells[0], split="test")
     data = DataSets(Workspace(tmp_path), DemoSettings.quick_check().packaged_scale(tmp_path), generate=None, device=cpu)
@@ -132,7 +132,7 @@ def test_seconds_are_not_those_that_another_cell_has_found(tmp_path, monkeypatch
 
 
 class ManualWorkers:
-    """Workers for two pieces of work at a time, which end when the test says so."""
+    """Two workers whose tasks end when the test sets their results."""
 
     count = 2
 
@@ -145,7 +145,7 @@ class ManualWorkers:
 
 
 def test_each_of_several_trainings_is_recorded_when_it_ends(tmp_path, monkeypatch):
-    """The first ends, the second is interrupted after that: by whom nothing is lost, and no time counted twice."""
+    """The second training is interrupted after the first has ended; the first stays recorded with its own time."""
     monkeypatch.setattr(DataSets, "tasks", lambda data, class_name: Balls())
     table, cpu, workers = DemoSettings.quick_check().table, torch.device("cpu"), ManualWorkers()
     workspace = Workspace(tmp_path, {"hyperplanes": "hyperplanes", "point_multiplane": "point_multiplane"})
@@ -177,4 +177,4 @@ def test_each_of_several_trainings_is_recorded_when_it_ends(tmp_path, monkeypatc
     assert {name: written[name]["done"] for name in written} == {"point_multiplane": True, "hyperplanes": False}
     assert written["point_multiplane"]["seconds"] < written["hyperplanes"]["seconds"]
     evaluated = {args[0].cell.method for name, args, _ in workers.submitted if name == "_evaluate"}
-    assert evaluated == {"point_multiplane", "scratch_2", "nearest_view"}, "begun beside the second training"
+    assert evaluated == {"point_multiplane", "scratch_2", "nearest_view"}, "evaluations start meanwhile"

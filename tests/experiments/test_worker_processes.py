@@ -1,4 +1,4 @@
-"""Source of truth: what the operating system does to a process, and what is left to say of it."""
+"""Source of truth: signals that the operating system sends to worker processes."""
 
 import multiprocessing
 import os
@@ -14,9 +14,9 @@ from hyperplanes.experiments.workers import Workers
 
 @pytest.fixture(scope="module")
 def ended():
-    """What a process has answered that was sent SIGINT before it had imported anything, and the error of its pool.
+    """The answers of a worker that got SIGINT before its imports, and the error of its pool.
 
-    It is killed in the end: SIGKILL, as a system that runs out of memory sends it.
+    At the end the worker is killed by SIGKILL, as by a system that runs out of memory.
     """
     methods = {"divide": partial(divmod, 7, 2), "end": partial(signal.raise_signal, signal.SIGKILL)}
     pool = Workers(2, partial(SimpleNamespace, data=SimpleNamespace(generated={}), **methods))
@@ -35,11 +35,11 @@ def ended():
     return answers, error
 
 
-def test_of_a_worker_that_is_killed_one_line_is_said(ended):
+def test_a_killed_worker_is_reported_in_one_line(ended):
     _, error = ended
     assert error.match("one was killed .*; run the same command again with fewer --workers")
 
 
-def test_ctrl_c_while_a_worker_starts_is_left_to_its_parent(ended):
+def test_a_starting_worker_ignores_ctrl_c(ended):
     answers, _ = ended
     assert answers == [(3, 1)]

@@ -1,4 +1,4 @@
-"""Source of truth: voxels draw long animations of many views, on a CPU; what is told is done."""
+"""Source of truth: long animations of many views are rendered from voxels on a CPU, unless another choice is given."""
 
 import pytest
 import torch
@@ -23,13 +23,13 @@ VOXELS = BakedField(torch.full((4, 4, 4), -1, dtype=torch.int32), torch.zeros(0,
     ("frames", "side", "shown", "representation", "by_voxels"),
     [
         (48, 400, 25, "auto", True),
-        (8, 400, 25, "auto", False),  # few pictures
+        (8, 400, 25, "auto", False),  # few frames
         (48, 400, 15, "auto", False),  # few views
         (1, 8, 3, "voxels", True),
         (48, 400, 25, "field", False),
     ],
 )
-def test_voxels_draw_long_animations_of_many_views(frames, side, shown, representation, by_voxels):
+def test_long_animations_of_many_views_are_rendered_from_voxels(frames, side, shown, representation, by_voxels):
     lens = camera.symmetric_intrinsics(side, side, 0.8)
     cameras = camera.pinhole(lens, torch.eye(4).expand(frames, 4, 4), side, side)
     poses = torch.eye(4).expand(shown, 4, 4)
@@ -39,8 +39,8 @@ def test_voxels_draw_long_animations_of_many_views(frames, side, shown, represen
     assert choose_representation(found, views, cameras, representation) is found or not by_voxels
 
 
-def test_voxels_have_the_size_that_the_views_were_seen_by():
-    """Larger pictures show no more: between the rays of the views' pixels voxels would be what they began as."""
+def test_the_number_of_voxels_depends_on_the_size_of_the_views():
+    """More voxels would not help in larger pictures, because those between the rays of the views are not fitted."""
     lens, sides = camera.symmetric_intrinsics(64, 64, 0.8), []
     views = Views(torch.ones(25, 3, 64, 64), camera.pinhole(lens, torch.eye(4).expand(25, 4, 4), 64, 64))
     larger = camera.resized(camera.select(views.cameras, [0]), 256, 256)
@@ -48,7 +48,7 @@ def test_voxels_have_the_size_that_the_views_were_seen_by():
     assert sides == [default_side((64, 64))]
 
 
-def test_turntables_have_a_pixel_at_least():
+def test_turntables_with_no_pixel_are_refused():
     for size in (0, -7):
         with pytest.raises(ValueError, match=f"size: expected at least 1 pixel, got {size}"):
             orbit_cameras(ball_views(ring(3, (8, 8))), 2, size=size)

@@ -1,4 +1,4 @@
-"""Source of truth: the fields that were baked, Beer and Lambert's law of a slab, packed PyTorch, what was written."""
+"""Sources of truth: the baked fields, the Beer-Lambert law for a slab, packed PyTorch, and saved files."""
 
 import math
 from dataclasses import replace
@@ -28,7 +28,7 @@ CAMERAS = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibona
 
 
 def soft_ball(points, directions):
-    """A ball with a soft surface, coloured by place and, a little, by direction."""
+    """A ball with a soft surface, whose colour depends on position and slightly on direction."""
     density = 40 * torch.sigmoid((0.6 - points.norm(dim=-1)) * 30)
     colour = 0.5 + 0.3 * torch.sin(2 * points) + 0.15 * directions
     return colour.clamp(0, 1), density
@@ -57,7 +57,7 @@ def coarse(adapted):
 
 @pytest.fixture(scope="module")
 def other_views(adapted):
-    """Pictures of the field from elsewhere."""
+    """Pictures of the field from other cameras."""
     cameras = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(3, 3.0), 48, 48)
     return Views(adapted.render(cameras).images, cameras)
 
@@ -68,15 +68,15 @@ def quality_of(field, views):
 
 
 def test_harmonics_are_orthonormal():
-    # Source of truth: the integral over the sphere, by an even spread of directions.
+    # Source of truth: the integral over the sphere, with evenly distributed directions.
     directions = camera.fibonacci_sphere(20_000, 1.0)[:, 2, :3]
     basis = spherical_harmonics(directions)
     gram = basis.T @ basis * (4 * math.pi / len(directions))
     assert torch.allclose(gram, torch.eye(9), atol=2e-3)
 
 
-def test_baked_pictures_have_further_rays_at_edges(baked, monkeypatch):
-    monkeypatch.setattr(baking, "EDGE", 0.2)  # of a soft ball
+def test_baked_pictures_have_more_rays_at_edges(baked, monkeypatch):
+    monkeypatch.setattr(baking, "EDGE", 0.2)  # the ball is soft
     found = BakedScene(baked).render(CAMERAS)
     monkeypatch.setattr(baking, "EDGE", math.inf)
     plain = BakedScene(baked).render(CAMERAS)
@@ -84,7 +84,7 @@ def test_baked_pictures_have_further_rays_at_edges(baked, monkeypatch):
     assert not torch.equal(found.opacity, plain.opacity)
 
 
-def test_baked_pictures_are_those_of_the_field(seen, baked):
+def test_baked_pictures_agree_with_the_field(seen, baked):
     # Source of truth: the field itself, rendered by marching.
     truth = seen
     found = BakedScene(baked, steps=256).render(CAMERAS)
@@ -94,7 +94,7 @@ def test_baked_pictures_are_those_of_the_field(seen, baked):
 
 
 def test_the_compiled_caster_agrees_with_packed_torch(baked):
-    # Source of truth: the same voxels as a callable through the generic renderer, at the same steps.
+    # Source of truth: the same voxels as a field in the generic renderer, with the same steps.
     scene = BakedScene(baked)
     sampling, cameras = RayMarching(scene.steps, STOP), camera.select(CAMERAS, [2, 5])
     generic = render(baked, cameras, sampling, bounds=baked.occupancy.bounds, occupancy=baked.occupancy)
@@ -104,17 +104,17 @@ def test_the_compiled_caster_agrees_with_packed_torch(baked):
 
 
 def test_shaded_voxels_have_the_colours_of_rays_through_their_centres(baked):
-    # Source of truth: the harmonics of each direction, by the field's own function.
+    # Source of truth: the spherical harmonics of each direction.
     eye = torch.tensor([0.5, -2.0, 1.0])
     found = shade_voxels(baked.values, baked.centres(), eye)
     basis = spherical_harmonics(torch.nn.functional.normalize(baked.centres() - eye, dim=-1))
     density, coefficients = baked.values[:, :1], baked.values[:, 1:].unflatten(1, (3, 9))
     expected = torch.cat([density, density * (coefficients * basis[:, None]).sum(-1)], 1)
     torch.testing.assert_close(found[:-1], expected, rtol=1e-4, atol=1e-4)
-    assert not found[-1].any()  # what a voxel without a row reads
+    assert not found[-1].any()  # the row for empty voxels
 
 
-def test_a_grid_is_the_box_of_its_voxels_with_a_border_of_none(baked):
+def test_a_grid_is_the_bounding_box_of_its_voxels_with_an_empty_border(baked):
     grid = VoxelGrid.of(baked.index, baked.bounds)
     places = (grid.rows >= 0).nonzero()
     assert places.amin(0).tolist() == [1, 1, 1]
@@ -148,7 +148,7 @@ def test_a_constant_slab_is_beer_lambert():
     assert torch.allclose(seen.colour, (1 - seen.opacity)[:, None].expand(1, 3), atol=1e-5)  # black over white
 
 
-def test_a_baked_field_survives_the_disk(baked, tmp_path):
+def test_a_saved_baked_field_is_read_back(baked, tmp_path):
     baked.save(tmp_path / "ball.safetensors")
     again = BakedField.load(tmp_path / "ball.safetensors")
     assert torch.equal(again.index >= 0, baked.index >= 0)
@@ -160,7 +160,7 @@ def test_a_baked_field_survives_the_disk(baked, tmp_path):
 
 
 @pytest.mark.parametrize("unit", [1e-10, 1e-4, 1e10])
-def test_the_file_holds_the_same_object_in_every_unit_of_the_world(baked, tmp_path, unit):
+def test_a_saved_field_does_not_depend_on_the_unit_of_the_world(baked, tmp_path, unit):
     values = torch.cat([baked.values[:, :1] / unit, baked.values[:, 1:]], 1)
     BakedField(baked.index, values, Sphere(radius=unit)).save(tmp_path / "ball.safetensors")
     again = BakedField.load(tmp_path / "ball.safetensors")
@@ -175,7 +175,7 @@ def test_the_file_holds_the_same_object_in_every_unit_of_the_world(baked, tmp_pa
     torch.testing.assert_close(again(points * unit, directions)[0], baked(points, directions)[0], atol=5e-3, rtol=0)
 
 
-def test_a_file_that_is_no_baked_field_is_named(tmp_path):
+def test_a_file_that_is_not_a_baked_field_is_refused(tmp_path):
     from hyperplanes.utilities.checkpoints import save_tensors
 
     save_tensors(tmp_path / "other.safetensors", {"weights": torch.zeros(3)})
@@ -199,7 +199,7 @@ def test_wrong_arguments_are_refused(adapted):
 
 
 def test_distances_to_filled_cells():
-    # Source of truth: the cells walked one by one, by the definition of the distance.
+    # Source of truth: a loop over the cells with the definition of the distance.
     index = torch.where(torch.rand(6, 6, 6, generator=torch.Generator().manual_seed(0)) < 0.03, 0, -1)
     away = distance_to_filled(index)
     cells = [
@@ -218,7 +218,7 @@ def test_distances_to_filled_cells():
 
 
 def test_transmittance_of_a_slab_is_beer_lambert():
-    # Closed form: exp(-optical_depth of the voxels between a voxel and the outside).
+    # Closed form: exp(-optical depth of the voxels between a voxel and the border).
     optical_depth = torch.full((8, 8, 8), 0.3)
     cells = torch.tensor([[4, 4, 1], [4, 4, 7]])
     upward, downward = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
@@ -227,8 +227,8 @@ def test_transmittance_of_a_slab_is_beer_lambert():
     torch.testing.assert_close(found, torch.exp(-0.3 * layers))
 
 
-def test_transmittance_is_that_of_a_walk_in_plain_torch():
-    # Source of truth: the same walk with all cells at once, step by step.
+def test_transmittance_agrees_with_marching_in_pytorch():
+    # Source of truth: the same marching in PyTorch, with all cells at once.
     generator = torch.Generator().manual_seed(0)
     optical_depth = torch.rand(12, 12, 12, generator=generator) * (torch.rand(12, 12, 12, generator=generator) < 0.3)
     cells, directions = torch.randint(0, 12, (50, 3), generator=generator), camera.fibonacci_sphere(9, 1.0)[:, 2, :3]
@@ -241,7 +241,7 @@ def test_transmittance_is_that_of_a_walk_in_plain_torch():
 
 
 @pytest.mark.parametrize("side", [80, 96, 112, 128, 48])
-def test_no_region_is_lost_in_another_resolution(side):
+def test_resampling_to_another_resolution_loses_no_region(side):
     occupied = torch.zeros(64, 64, 64, dtype=torch.bool)
     occupied[21:43, 21:43, 21:43] = True
     before = Occupancy(occupied, Sphere())
@@ -251,8 +251,8 @@ def test_no_region_is_lost_in_another_resolution(side):
     assert _resampled(before, side).contains(points).all()
 
 
-def test_what_lies_outside_the_sphere_is_not_baked():
-    """Rays end at the sphere, so that a field was never asked there."""
+def test_nothing_outside_the_sphere_is_baked():
+    """Rays end at the sphere, so that the field is not trained outside."""
     everywhere = AdaptedField(
         lambda points, _: (points * 0, points.new_full((len(points),), 9.0)), full(Sphere(), 16), RayMarching(32)
     )
@@ -260,8 +260,8 @@ def test_what_lies_outside_the_sphere_is_not_baked():
     assert found.centres().norm(dim=1).max() < 1 + 2 * 2 / 32
 
 
-def test_fitting_brings_back_colours_and_densities(coarse, seen, other_views):
-    # Source of truth: the field's own pictures, of cameras that are not fitted to.
+def test_fitting_restores_colours_and_densities(coarse, seen, other_views):
+    # Source of truth: pictures of the field from cameras that are not used for fitting.
     faded, steps = replace(coarse, values=0.9 * coarse.values), []
     fitted = fit_voxels(faded, Views(seen.images, CAMERAS), steps=30, pixels=1024, on_step=steps.append)
     assert quality_of(fitted, other_views) > quality_of(faded, other_views) + 5
@@ -269,8 +269,8 @@ def test_fitting_brings_back_colours_and_densities(coarse, seen, other_views):
     assert torch.equal(fitted.index, coarse.index)
 
 
-def test_fitting_begins_with_voxels_that_rays_pass_through(coarse, seen, other_views, monkeypatch):
-    """Voxels of a ball that is too large: without the bound of depths, what is opaque hides what is behind it."""
+def test_fitting_starts_with_voxels_of_bounded_optical_depth(coarse, seen, other_views, monkeypatch):
+    """Voxels that are too dense: without the bound, opaque voxels occlude those behind them, which get no gradient."""
     opaque = replace(coarse, values=torch.cat([coarse.values[:, :1].clamp_min(300.0), coarse.values[:, 1:]], 1))
     found = []
     for bound in (voxel_fitting.LARGEST_DEPTH, math.inf):
@@ -280,8 +280,8 @@ def test_fitting_begins_with_voxels_that_rays_pass_through(coarse, seen, other_v
     assert found[0] > found[1] + 1
 
 
-def test_fitting_by_one_ray_a_pixel_makes_edges_soft(monkeypatch):
-    """Pictures whose pixels are the mean of their area, as photographs are, of a ball with a hard surface."""
+def test_fitting_with_several_rays_per_edge_pixel_is_better_than_with_one(monkeypatch):
+    """A ball with a hard surface, in pictures whose pixels are means over their areas, as in photographs."""
     ball = AdaptedField(
         lambda points, _: (points * 0, 500.0 * (points.norm(dim=-1) < 0.6)), full(Sphere(), 48), RayMarching(192)
     )
@@ -295,14 +295,14 @@ def test_fitting_by_one_ray_a_pixel_makes_edges_soft(monkeypatch):
 
 
 def _means_of_areas(adapted, count):
-    """Pictures of 24x24, of 16 rays a pixel."""
+    """Pictures of 24x24 pixels with 16 rays per pixel."""
     cameras = camera.pinhole(camera.symmetric_intrinsics(24, 24, 0.7), camera.fibonacci_sphere(count, 3.0), 24, 24)
     fine = adapted.render(camera.resized(cameras, 96, 96), antialias=False).images
     return Views(avg_pool2d(fine, 4), cameras)
 
 
-def test_a_guide_keeps_what_few_views_do_not_show(adapted, coarse, seen, other_views):
-    """Two views of another brightness: without the guide all that they do not show is lost, with it little."""
+def test_a_guide_preserves_parts_that_few_views_do_not_show(adapted, coarse, seen, other_views):
+    """Two darker views: without the guide, PSNR of other views decreases; with it, it decreases less."""
     guide = render_guide(adapted, Views(seen.images, CAMERAS)[:2])
     assert guide is not None
     assert guide.size == (CAMERAS.height[0] // 2, CAMERAS.width[0] // 2)
@@ -312,8 +312,8 @@ def test_a_guide_keeps_what_few_views_do_not_show(adapted, coarse, seen, other_v
     assert render_guide(adapted, other_views[[0, 1, 2] * 6]) is None
 
 
-def test_the_guide_of_splats_is_of_their_voxels_in_the_size_of_the_views(adapted, seen, baked):
-    """Source of truth: the field that the voxels were baked from, from the same places."""
+def test_the_guide_of_splats_is_rendered_from_voxels_in_the_size_of_the_views(adapted, seen, baked):
+    """Source of truth: the field that the voxels were baked from, rendered from the same cameras."""
     few = Views(seen.images, CAMERAS)[:2]
     guide, wanted = (render_guide(source, few, size=few.size) for source in (BakedScene(baked), adapted))
     assert guide is not None
@@ -322,8 +322,8 @@ def test_the_guide_of_splats_is_of_their_voxels_in_the_size_of_the_views(adapted
     assert float(psnr(guide.images, wanted.images).mean()) > 35
 
 
-def test_a_ray_beside_the_voxels_and_nearly_parallel_to_an_axis_ends(baked):
-    """A component of 1e-20, as products of cosines have it, asks for more steps than there are numbers."""
+def test_rendering_ends_for_a_ray_that_is_nearly_parallel_to_an_axis(baked):
+    """With a component of 1e-20, as in products of cosines, the number of steps would overflow."""
     rays = Rays(
         torch.tensor([[2.0, 0.0, -3.0]]), torch.tensor([[-1e-20, 0.0, 1.0]]), torch.tensor([2.0]), torch.tensor([4.0])
     )
@@ -332,5 +332,5 @@ def test_a_ray_beside_the_voxels_and_nearly_parallel_to_an_axis_ends(baked):
     worker = Thread(target=lambda: seen.append(render_voxels(grid, shaded, rays, step=0.01)), daemon=True)
     worker.start()
     worker.join(30)
-    assert seen, "still stepping"
+    assert seen, "the renderer did not end"
     assert seen[0].opacity.tolist() == [0.0]

@@ -1,4 +1,4 @@
-"""Source of truth: a ball of known density and colour, whose surface and volume have closed forms."""
+"""Source of truth: a ball with known density and colour, whose surface and volume have closed forms."""
 
 import gc
 import io
@@ -28,7 +28,7 @@ BOUNDS = Sphere(CENTRE, 2.0)
 
 
 def ball():
-    """Density 100 that fades over the last 0.05 of the radius; red on +x's side, blue on the other."""
+    """A ball of density 100 whose surface is 0.05 soft; red on the side of +x, blue on the other."""
 
     def field(points, directions):
         local = points - points.new_tensor(CENTRE)
@@ -64,8 +64,8 @@ def test_the_mesh_of_a_ball():
     np.testing.assert_array_equal(surface.colours[clear, 0] > 0.5, side[clear] > 0)
 
 
-def test_a_surface_that_leaves_the_sphere_is_closed_there():
-    """Rays end at the sphere, so that what is beyond it was never seen: the corners of the cube hold nothing."""
+def test_a_surface_is_closed_at_the_sphere():
+    """Rays end at the sphere, so that the corners of the cube are empty."""
     everywhere = AdaptedField(
         lambda points, _: (torch.ones_like(points), points.new_full((len(points),), 99.0)),
         full(BOUNDS, 8),
@@ -78,10 +78,11 @@ def test_a_surface_that_leaves_the_sphere_is_closed_there():
 
 
 def test_the_level_is_the_one_with_the_rendered_silhouettes():
-    """Closed form: a ball of density 8 within 0.5 and of 0.3 around it, up to 0.8: half opaque through its middle only.
+    """Closed form: a ball of density 8 within radius 0.5, with haze of density 0.3 up to radius 0.8.
 
-    A chord of length s through the haze is half opaque where 0.3 s = log 2, s = 2.3, which no chord has: the silhouette
-    is that of the core, where 8 s = log 2 at s = 0.09, which is a radius of 0.498. The default level, 11.1, misses it.
+    A chord of length s through the haze has opacity 1/2 if 0.3 s = log 2, or s = 2.3, which no chord has. So the
+    silhouette is that of the core, where 8 s = log 2 at s = 0.09, at a radius of 0.498. The default level, 11.1, is
+    above all densities.
     """
 
     def field(points, directions):
@@ -102,11 +103,11 @@ def test_the_level_is_the_one_with_the_rendered_silhouettes():
         extract_mesh(adapted, density=density)
 
 
-def test_a_hole_with_a_wall_behind_it_is_noticed_by_depth_and_closed_by_the_level():
-    """Closed form: a hollow ball, 0.3 thick, of density 30 within 0.4 of the +x axis, 300 elsewhere.
+def test_a_hole_in_front_of_a_wall_lowers_the_depth_agreement_and_the_level_closes_it():
+    """Closed form: a hollow ball with a wall of 0.3, of density 30 within 0.4 of the +x axis and 300 elsewhere.
 
-    From far along x both are opaque (30 x 0.3 = 9), so the silhouettes of every level below 300 are the same, but a
-    level above 30 has a hole there: (0.4 / 0.8)^2 of the disc, through which the far wall is seen.
+    From far along x, both are opaque (30 x 0.3 = 9), so that all levels below 300 have the same silhouette. A level
+    above 30 has a hole of (0.4 / 0.8)^2 of the disc, through which the opposite wall is visible.
     """
 
     def field(points, directions):
@@ -132,11 +133,12 @@ def test_a_hole_with_a_wall_behind_it_is_noticed_by_depth_and_closed_by_the_leve
 
 
 @pytest.mark.parametrize(("fog", "whole"), [(8.0, True), (0.1, False)])
-def test_what_no_camera_sees_into_is_filled_and_what_one_sees_through_is_not(fog, whole):
-    """Closed form: a ball of density 300 with a tunnel of fog, 0.6 wide, along x, which a level of 100 cuts out.
+def test_hidden_cavities_are_filled_and_transparent_tunnels_are_not(fog, whole):
+    """Closed form: a ball of density 300 with a tunnel of fog, 0.6 wide, along x, which is empty at a level of 100.
 
-    Of density 8 it is opaque from all sides, 0.3 of the light gone after 0.045, so the ball is whole (Euler number 2);
-    of density 0.1 a camera on the axis sees through it, by exp(-0.1 x 1.6) = 85 % of the light (0, as a torus).
+    With density 8 the fog is opaque from all sides, with opacity 0.3 after 0.045, so that the ball has no tunnel
+    (Euler number 2). With density 0.1 the tunnel has a transmittance of exp(-0.1 x 1.6) = 85 % (Euler number 0, as a
+    torus).
     """
 
     def field(points, directions):
@@ -160,7 +162,7 @@ def test_what_no_camera_sees_into_is_filled_and_what_one_sees_through_is_not(fog
         assert mesh.volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.08)
 
 
-def test_a_level_that_is_never_reached():
+def test_a_level_above_all_densities_is_refused():
     with pytest.raises(ValueError, match=r"highest density, 100, got 1e\+03"):
         extract_mesh(ball(), voxels=24, level=1000.0)
 
@@ -175,17 +177,17 @@ def test_meshes_are_read_back_with_their_colours(kind, tmp_path):
     assert {tuple(colour) for colour in colours} <= {(255, 0, 0), (0, 0, 255)}
 
 
-def test_a_mesh_of_another_kind(tmp_path):
+def test_another_format_of_a_mesh_is_refused(tmp_path):
     with pytest.raises(ValueError, match="ply, glb, obj"):
         save_mesh(extract_mesh(ball(), voxels=12), tmp_path / "ball.fbx")
 
 
-def test_up_is_found_whatever_the_world_calls_it():
+def test_the_up_direction_is_found_for_any_up_axis():
     for up in ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
         assert np.dot(upward(views(40, up=up).cameras), up) > 0.98
 
 
-def test_an_orbit_looks_at_the_middle_from_one_height():
+def test_an_orbit_looks_at_the_centre_from_a_constant_height():
     scene = views(up=(0.0, 0.0, 1.0), count=40)
     cameras = orbit_cameras(scene, 8, size=32, elevation=0.4)
     assert camera.image_size(cameras) == (32, 32)
@@ -198,10 +200,10 @@ def test_an_orbit_looks_at_the_middle_from_one_height():
 
 
 @pytest.mark.parametrize(("distance", "moved"), [(5.0, False), (1.9, True)])
-def test_an_orbit_after_close_ups_stands_back_until_the_object_fits(distance, moved):
-    """A ball of angular radius asin(r / d): it fits into half the opening angle from 5 away, and not from 1.9."""
+def test_an_orbit_of_close_ups_is_far_enough_to_show_the_object(distance, moved):
+    """A ball with the angular radius asin(r / d) fits into half of the field of view at distance 5, and not at 1.9."""
     eyes = camera.centres(views(40).cameras) - torch.tensor(CENTRE)
-    eyes[::2] *= distance / 5  # close-ups and, for the rest of the outline, some from afar
+    eyes[::2] *= distance / 5  # close-ups, and for the whole outline some far views
     eyes[1::8] *= distance / 5
     pose = camera.look_at(eyes + torch.tensor(CENTRE), CENTRE)
     cameras = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.9), pose, 48, 48)
@@ -220,7 +222,7 @@ def test_an_orbit_after_close_ups_stands_back_until_the_object_fits(distance, mo
     assert float(pixels.max()) < 47
 
 
-def test_an_orbit_through_a_lens_stands_where_views_without_masks_put_it(tmp_path):
+def test_an_orbit_of_distorted_cameras_has_the_same_poses(tmp_path):
     bare = views()
     lens = distorted(bare.cameras, torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0]))
     seen = Views(bare.images, lens, torch.ones(6, 1, 16, 16), bounds=BOUNDS)
@@ -232,20 +234,20 @@ def test_an_orbit_through_a_lens_stands_where_views_without_masks_put_it(tmp_pat
 
 
 @pytest.mark.parametrize("kind", ["webp", "gif"])
-def test_a_turntable_moves(kind, tmp_path):
+def test_a_turntable_has_all_frames(kind, tmp_path):
     path = save_turntable(ball(), views(), tmp_path / f"turn.{kind}", frames=5, size=24)
     with Image.open(path) as animation:
         assert (animation.n_frames, animation.size, animation.info["loop"]) == (5, (24, 24), 0)
 
 
-def test_a_turntable_of_another_kind(tmp_path):
+def test_another_format_of_a_turntable_is_refused(tmp_path):
     with pytest.raises(ValueError, match="webp"):
         save_turntable(ball(), views(), tmp_path / "turn.avi")
     with pytest.raises(ValueError, match="webp, gif"):
         encode_animation(np.zeros((1, 2, 2, 3), np.uint8), "avi")
 
 
-def test_images_are_written_as_they_are(tmp_path):
+def test_images_are_written_unchanged(tmp_path):
     images = torch.rand(3, 3, 4, 5)
     paths = save_images(images, tmp_path / "new", ("a/x.png", "a/y.png", "b/z"))
     assert [path.name for path in paths] == ["x.png", "y.png", "z.png"]
@@ -264,11 +266,11 @@ def test_images_are_written_as_they_are(tmp_path):
     assert not (tmp_path / "wrong").exists()
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pipes that imageio-ffmpeg leaves open
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # its pipes stay open
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.parametrize("kind", ["mp4", "webm"])
 def test_a_video_has_the_frames(kind, tmp_path):
-    # Source of truth: ffmpeg's own reader; sizes are made even, and colours survive the codec nearly.
+    # Source of truth: the reader of ffmpeg. Sizes are made even, and the codec changes colours slightly.
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is not installed; the extra video")
     frames = np.zeros((6, 33, 48, 3), np.uint8)
     frames[..., 0] = np.arange(6)[:, None, None] * 40
@@ -305,7 +307,7 @@ def test_a_webm_is_as_good_as_an_mp4_and_its_encoder_warns_of_nothing(tmp_path, 
 
 
 @pytest.mark.parametrize("seconds", [0.5, 5.0])
-def test_a_video_lasts_as_long_as_it_was_asked_to(monkeypatch, seconds):
+def test_a_video_has_the_given_duration(monkeypatch, seconds):
     given = []
     monkeypatch.setattr(images, "_video", lambda frames, kind, rate: given.append((frames, rate)) or b"")
     frames = np.arange(2, dtype=np.uint8)[:, None, None, None].repeat(3, 3)
@@ -317,7 +319,7 @@ def test_a_video_lasts_as_long_as_it_was_asked_to(monkeypatch, seconds):
 
 
 @pytest.mark.parametrize("kind", ["webp", "gif"])
-def test_an_animation_lasts_as_long_as_it_was_asked_to(kind):
+def test_an_animation_has_the_given_duration(kind):
     frames = np.random.default_rng(0).integers(0, 255, (48, 2, 2, 3), np.uint8)
     with Image.open(io.BytesIO(encode_animation(frames, kind, seconds=4.0))) as picture:
         durations = []

@@ -1,6 +1,6 @@
-"""The page that turns an object: its pictures against those of the baked form, in a real browser.
+"""The interactive page of an object, in a real browser.
 
-Source of truth: `BakedScene`, which the CPU renders. Needs Chromium, whose software renderer has WebGL 2.
+Source of truth: pictures of `BakedScene`. These tests need Chromium, whose software renderer supports WebGL 2.
 """
 
 import shutil
@@ -35,7 +35,7 @@ chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 
 def two_balls(points, directions):
-    """Two balls with soft surfaces, coloured by place and direction, so that no view is that of another."""
+    """Two balls with soft surfaces and colours by position and direction, so that all views differ."""
     local = (points - points.new_tensor(SPHERE.centre)) / SPHERE.radius
     large = 40 * torch.sigmoid((0.5 - (local - local.new_tensor([0.1, 0.2, 0.0])).norm(dim=-1)) * 30)
     small = 40 * torch.sigmoid((0.2 - (local - local.new_tensor([-0.5, -0.4, 0.3])).norm(dim=-1)) * 30)
@@ -63,14 +63,14 @@ def coarse():
 
 @pytest.fixture(scope="module")
 def small(views):
-    """A part of a page that is quick to draw."""
+    """A fragment of a page that renders quickly."""
     tiny = bake(AdaptedField(two_balls, full(SPHERE, 8), RayMarching(16)), side=8)
     fragment = page_of(tiny, views, picture=turning_picture(tiny, views, frames=1, size=8))
     return f'<div style="width:40px;float:left">{fragment}</div>'
 
 
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_the_page_shows_what_the_baked_form_shows(baked, views, tmp_path):
+def test_the_page_shows_the_same_picture_as_the_baked_scene(baked, views, tmp_path):
     page = save_page(page_of(baked, views), tmp_path / "page.html", "Two <balls>")
     one = camera.select(views.cameras, [3])
     picture = tmp_path / "shot.png"
@@ -112,7 +112,7 @@ const tap = (box) => box.dispatchEvent(new PointerEvent("pointerdown"));
 
 
 class Listener(BaseHTTPRequestHandler):
-    """A server of one page, which tells it what it saw."""
+    """A server of one page, to which the page posts its results."""
 
     page, loads, told = b"", 0, None
 
@@ -132,7 +132,7 @@ class Listener(BaseHTTPRequestHandler):
 
 
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_of_many_viewers_twelve_draw_and_what_is_tapped_or_lost_comes_back(small, tmp_path):
+def test_of_many_viewers_twelve_render_and_tapped_or_lost_ones_are_restored(small, tmp_path):
     page = save_page("\n".join([*[small] * 18, f"<script>{STORY}</script>"]), tmp_path / "page.html", "many")
     told, loads = heard(page, tmp_path, 3)
     states = dict(each.split(" ") for each in told if "focus" not in each)
@@ -146,7 +146,7 @@ def test_of_many_viewers_twelve_draw_and_what_is_tapped_or_lost_comes_back(small
 
 
 def heard(page, folder, most):
-    """What a page tells in a browser, part by part, and how many times it is loaded; it is closed after so many."""
+    """The results that a page posts from a browser, and how often it was loaded, at most `most` times."""
     listener = type("Heard", (Listener,), {"page": page.read_bytes()})
     flags = [each for each in FLAGS if not each.startswith("--virtual-time")]
     with ThreadingHTTPServer(("127.0.0.1", 0), listener) as server:
@@ -217,7 +217,7 @@ const told = [], box = document.querySelector(".voxels");
 
 
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_the_object_turns_by_the_first_button_and_by_keys_of_its_own(small, tmp_path):
+def test_the_object_turns_with_the_primary_button_and_keys_without_modifiers(small, tmp_path):
     told, _ = heard(save_page(f"{small}<script>{INPUT}</script>", tmp_path / "page.html", "one"), tmp_path, 3)
     found = dict(each.split(" ") for each in told)
     assert found == {
@@ -251,12 +251,12 @@ const told = JSON.parse(sessionStorage.told || "[]");
 
 
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_a_camera_of_the_address_is_taken_when_it_is_typed_and_only_one_that_there_can_be(small, tmp_path):
+def test_a_typed_camera_address_is_used_only_if_it_is_valid(small, tmp_path):
     told, _ = heard(save_page(f"{small}<script>{ADDRESSES}</script>", tmp_path / "page.html", "one"), tmp_path, 9)
     assert told == ["turns"] * 6 + ["12x8"]
 
 
-def test_a_page_is_one_file_that_asks_for_nothing(coarse, views, tmp_path):
+def test_a_page_is_one_file_without_external_resources(coarse, views, tmp_path):
     picture = turning_picture(coarse, views, frames=2, size=32)
     text = save_page(page_of(coarse, views, picture=picture), tmp_path / "page.html", "Two <balls>").read_text()
     assert "<title>Two &lt;balls&gt;</title>" in text
@@ -264,8 +264,8 @@ def test_a_page_is_one_file_that_asks_for_nothing(coarse, views, tmp_path):
     assert not [word for word in ("http:", "https:", 'src="/', "import(", "fetch(") if word in text]
 
 
-def test_a_page_that_is_too_large_loses_precision_before_it_is_refused(coarse, views, tmp_path):
-    """All of the file counts: the picture, the viewer, and what stands around them with the longest title."""
+def test_a_too_large_page_is_written_with_less_precision_or_refused(coarse, views, tmp_path):
+    """The limit is for the whole file, including the picture, the viewer and the longest title."""
     picture = bytes(4000)
     whole = len(page_of(coarse, views, picture=picture).encode())
     limit = whole - 1

@@ -1,4 +1,4 @@
-"""The page by viser. Source of truth: our own cameras, and a client's messages counted through viser's interface."""
+"""The page by viser. Sources of truth: cameras of this package, and pictures counted through viser's interface."""
 
 import math
 import sys
@@ -21,7 +21,7 @@ CAMERAS = camera.pinhole(camera.symmetric_intrinsics(16, 24, 0.7), camera.fibona
 
 
 def test_the_camera_of_a_visitor():
-    # Source of truth: the camera whose rotation, place and field of view the visitor was given.
+    # Source of truth: the camera from which the rotation, position and field of view of the visitor come.
     one = camera.select(CAMERAS, [1])
     rotation = live._quaternion(camera.camera_from_world(one)[0, :3, :3].T)
     fov = 2 * math.atan(16 / 2 / float(camera.intrinsics(one)[0, 1, 1]))
@@ -66,7 +66,7 @@ def test_a_very_wide_page_gets_a_picture_of_bounded_width():
 
 
 class Visitor:
-    """A visitor of the page, whose pictures are counted."""
+    """A visitor of the page that counts its pictures."""
 
     def __init__(self, aspect):
         self.client_id, self.scene, self.pictures, self.drawn = id(self), self, 0, threading.Event()
@@ -80,7 +80,7 @@ class Visitor:
 
 
 class Grey:
-    """A field whose pictures are grey, but for one that fails."""
+    """A field with grey pictures, of which one rendering can fail."""
 
     def __init__(self):
         self.fails = False
@@ -95,7 +95,7 @@ class Grey:
 
 @contextmanager
 def drawing(visitors, shown):
-    """A page without a server, while its thread draws."""
+    """A page without a server, whose thread renders inside the context."""
     page = object.__new__(LiveViewer)
     page._shown, page._others, page._chosen, page._height, page._text = shown, {}, live.ALONE, 48, "25 views"
     page._changed, page._stopped, page._note = threading.Condition(), False, SimpleNamespace(content="25 views")
@@ -121,7 +121,7 @@ def test_one_visitor_without_a_size_does_not_stop_the_pictures_of_others():
         assert page._note.content == "25 views"
 
 
-def test_a_picture_that_fails_is_noted_until_the_next_one(caplog):
+def test_a_failed_picture_is_reported_until_the_next_one(caplog):
     visitor, shown = Visitor(1.5), Grey()
     shown.fails = True
     with drawing([visitor], shown) as page:
@@ -136,7 +136,7 @@ def test_a_picture_that_fails_is_noted_until_the_next_one(caplog):
     assert "out of memory" in caplog.text
 
 
-def test_what_another_method_says_is_noted_while_it_is_chosen():
+def test_the_error_of_another_method_is_shown_while_it_is_chosen():
     with drawing([], Grey()) as page:
         page.show_other("scratch_2", None, "scratch_2: expected 2 views")
         assert page._note.content == "25 views"
@@ -146,7 +146,7 @@ def test_what_another_method_says_is_noted_while_it_is_chosen():
         assert page._note.content == "25 views"
 
 
-def test_a_visitor_who_drags_does_not_keep_others_waiting():
+def test_a_visitor_who_moves_the_camera_does_not_block_others():
     class Slow(Grey):
         def render(self, cameras):
             with page._changed:  # the camera moved again while the picture was drawn
@@ -178,7 +178,7 @@ def test_a_visitor_who_has_gone_is_forgotten():
         assert not page._visits
 
 
-def test_frusta_are_those_of_the_number_of_views_and_of_the_switch(monkeypatch):
+def test_frusta_are_shown_for_the_chosen_views_if_switched_on(monkeypatch):
     class Handle(SimpleNamespace):
         visible = True
 

@@ -1,4 +1,4 @@
-"""Source of truth: a ball of known density, whose depth, normals and surface have closed forms."""
+"""Source of truth: a ball with known density, whose depth, normals and surface have closed forms."""
 
 import json
 
@@ -20,7 +20,7 @@ from hyperplanes.rendering.renderer import RayMarching
 RADIUS, SIZE, STEPS, DENSITY = 0.7, 40, 200, 400.0
 CAMERAS = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), camera.fibonacci_sphere(8, 3.0), SIZE, SIZE)
 INTO = 1 / DENSITY + 2 / STEPS
-"""How far behind the surface the expected depth may lie: a mean free path and the length of a step."""
+"""The largest distance of the expected depth behind the surface: a mean free path and a step."""
 
 
 def ball(points, directions):
@@ -47,7 +47,7 @@ def test_depth_normals_and_accumulation_are_pictures(pictures, tmp_path):
     stated = json.loads((tmp_path / "depth/depth.json").read_text())
     rays = np.stack(np.meshgrid(*2 * [(np.arange(SIZE) - (SIZE - 1) / 2) / float(CAMERAS.intrinsics[0, 0, 0])]), -1)
     square = (rays**2).sum(-1) + 1
-    root = 9 - square * (9 - RADIUS**2)  # of z = (3 - sqrt(...)) / square on the sphere, cameras 3 away
+    root = 9 - square * (9 - RADIUS**2)  # z = (3 - sqrt(root)) / square on the sphere, at distance 3
     hit = root > 0.03
     expected = (3 - np.sqrt(np.where(hit, root, 0))) / square
     for view in range(8):
@@ -56,7 +56,7 @@ def test_depth_normals_and_accumulation_are_pictures(pictures, tmp_path):
         z = stated["nearest"] + (depth - 16384.0) / 49151 * (stated["farthest"] - stated["nearest"])
         behind = (z - expected)[hit] * np.sqrt(square[hit])
         assert behind.min() > -2 / STEPS
-        assert np.quantile(behind, 0.95) < INTO * 1.5  # along the ray; further where it grazes the surface
+        assert np.quantile(behind, 0.95) < INTO * 1.5  # along the ray; more at grazing angles
         assert (depth[root < -0.1] == 0).all()
         covered = pixels(tmp_path / f"accumulation/{view}.png")
         assert (covered[hit] > 250).all()
@@ -72,14 +72,14 @@ def test_depth_normals_and_accumulation_are_pictures(pictures, tmp_path):
 
 
 @pytest.mark.parametrize("count", [10**6, 500])
-def test_a_cloud_lies_on_the_surface(pictures, tmp_path, count):
+def test_a_point_cloud_is_on_the_surface(pictures, tmp_path, count):
     path = save_points(point_cloud(pictures, CAMERAS, Sphere(), count), tmp_path / "points.ply")
     cloud = trimesh.load(path)
     data = cloud.metadata["_ply_raw"]["vertex"]["data"]
     points, normals = (np.stack([data[name] for name in names], -1) for names in (("x", "y", "z"), ("nx", "ny", "nz")))
     assert 250 < len(points) <= count
     distance = np.linalg.norm(points, axis=1)
-    spread = 0.01 if count > 10**5 else 0.03  # the mean of points of a cell lies below the surface
+    spread = 0.01 if count > 10**5 else 0.03  # the mean of the points of a cell is below the surface
     assert np.abs(distance - RADIUS).mean() < INTO + spread
     assert np.abs(distance - RADIUS).max() < 0.15
     cosine = (normals * points).sum(1) / distance
@@ -91,8 +91,8 @@ def test_a_cloud_lies_on_the_surface(pictures, tmp_path, count):
     assert np.abs(corners).min() > 0.5 * RADIUS, "from all sides"
 
 
-def test_what_other_views_look_through_is_no_point(pictures):
-    """A view that claims a small wall 0.1 in front of the ball, past which the others see the background."""
+def test_points_that_other_views_contradict_are_removed(pictures):
+    """One view has a small wall 0.1 in front of the ball, where other views show the background."""
     depth, opacity = pictures.depth.clone(), pictures.opacity.clone()
     depth[0, 0, 12:28, 12:28] = 2.2
     spoilt = Pictures(pictures.images, opacity, depth, 0)

@@ -1,4 +1,4 @@
-"""Splats of baked voxels: axes, conventions, and the pictures that a viewer makes of the files.
+"""Splats of baked voxels: axes, conventions, and pictures that a viewer renders from the files.
 
 Source of truth: the formulas of "3D Gaussian Splatting" (Kerbl et al., 2023), written out here for a reader of the
 file; the pictures of what was written; autograd.
@@ -22,12 +22,12 @@ from hyperplanes.views import Views
 
 SIZE = 40
 CAMERAS = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), camera.fibonacci_sphere(6, 3.0), SIZE, SIZE)
-DOWN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))  # a viewer's world, y down, from ours
+DOWN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))  # world of a viewer, with y down, from our world
 
 
 @pytest.fixture(scope="module")
 def splats():
-    """A ball of voxels whose colour depends on place and, in all nine harmonics, on direction."""
+    """A ball of voxels whose colour depends on position and, with nine spherical harmonics, on direction."""
     side = 16
     axis = (torch.arange(side) + 0.5) / side * 2 - 1
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
@@ -44,7 +44,7 @@ def splats():
 
 
 def read(path):
-    """What a viewer makes of a PLY of splats: means, sizes, opacities, and colours by direction (Kerbl et al.)."""
+    """Read a PLY of splats as a viewer does: means, scales, rotations, opacities, colours by origin (Kerbl et al.)."""
     data = trimesh.load(path, process=False).metadata["_ply_raw"]["vertex"]["data"]
     column = lambda *names: torch.tensor(np.stack([data[name] for name in names], -1).astype(np.float32))  # noqa: E731
     means, first = column("x", "y", "z"), column("f_dc_0", "f_dc_1", "f_dc_2")
@@ -63,7 +63,7 @@ def read(path):
     return means, scales, quaternions, torch.sigmoid(column("opacity"))[:, 0], colours
 
 
-def test_a_viewer_of_the_file_sees_the_same_pictures_with_y_down(splats, tmp_path):
+def test_a_viewer_renders_the_same_pictures_from_the_file_with_y_down(splats, tmp_path):
     means, scales, quaternions, opacities, colours = read(save_splats(splats, tmp_path / "ball.ply"))
     assert torch.allclose(means, splats.means @ DOWN[:3, :3], atol=1e-6)
     for view in range(2):
@@ -89,7 +89,7 @@ def test_the_small_format(splats, tmp_path):
 
 
 def composited(splats, opacities, colours, one):
-    """The picture by autograd: each splat over all pixels, in the order of depth, with the kernel's thresholds."""
+    """A picture in PyTorch: all splats in order of depth over all pixels, with the thresholds of the kernel."""
     matrix, pose = camera.intrinsics(one)[0], camera.camera_from_world(one)[0]
     means, scales, quaternions = splats
     local = means @ pose[:3, :3].T + pose[:3, 3]
@@ -114,7 +114,7 @@ def composited(splats, opacities, colours, one):
     return (picture + left).T.reshape(3, *camera.image_size(one))
 
 
-def test_the_picture_and_its_gradients_are_those_of_autograd():
+def test_the_picture_and_its_gradients_agree_with_autograd():
     generator = torch.Generator().manual_seed(1)
     parts = [
         0.4 * torch.randn(5, 3, generator=generator),
@@ -135,8 +135,8 @@ def test_the_picture_and_its_gradients_are_those_of_autograd():
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-6)
 
 
-def test_fitting_brings_back_what_was_taken_away(splats):
-    """Of the same splats faded, moved and swollen, the pictures come back, with those inside of the ball left out."""
+def test_fitting_restores_changed_splats(splats):
+    """Splats that are faded, moved and enlarged give the same pictures after fitting, with hidden ones removed."""
     truth = splats.render(CAMERAS)
     generator = torch.Generator().manual_seed(2)
     spoilt = replace(
@@ -152,8 +152,8 @@ def test_fitting_brings_back_what_was_taken_away(splats):
     assert fit_splats(spoilt, Views(truth.clamp(0, 1), CAMERAS), steps=0) is spoilt
 
 
-def test_a_guide_keeps_what_few_views_do_not_show(splats):
-    """One view of another brightness: without the guide all that it does not show is lost, with it less."""
+def test_a_guide_preserves_parts_that_few_views_do_not_show(splats):
+    """One darker view: without the guide, PSNR of other views decreases; with it, it decreases less."""
     truth = splats.render(CAMERAS)
     shown = Views(0.8 * truth.clamp(0, 1), CAMERAS)[:1]
     guide = Views(truth.clamp(0, 1), CAMERAS)[1:4]

@@ -1,4 +1,4 @@
-"""Source of truth: a ball of known colours, painted as the support views show it, and its own pictures."""
+"""Source of truth: a ball with known colours, textured from support views, and pictures of its field."""
 
 import json
 import math
@@ -26,7 +26,7 @@ SIZE = 48
 
 
 def striped(points, directions):
-    """A hard ball with red stripes across and green ones along."""
+    """A hard ball with red stripes along one axis and green ones along another."""
     density = 300 * torch.sigmoid((0.7 - points.norm(dim=-1)) * 80)
     red, green = (torch.sigmoid(8 * torch.sin(5 * points[:, axis])) for axis in (0, 1))
     return torch.stack([red, green, torch.full_like(red, 0.3)], -1), density
@@ -45,7 +45,7 @@ def views(field):
 
 
 def render_surface(mesh, cameras):
-    """Pictures of a textured surface over white, and what they cover, by four rays a pixel at its triangles."""
+    """Pictures of a textured surface over white, with coverage, by intersecting four rays per pixel with triangles."""
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     height, width = camera.image_size(cameras)
     offsets = torch.tensor([-0.25, 0.25])
@@ -72,7 +72,7 @@ def mesh(field, views):
     return texture_surface(surface, field, views, faces=1200, size=128)
 
 
-def test_pictures_of_the_mesh_are_those_of_the_field(mesh, field):
+def test_pictures_of_the_mesh_agree_with_the_field(mesh, field):
     around = camera.look_at(torch.tensor([[1.0, 2.0, 2.0], [-2.4, 0.6, -1.5]]), (0.0, 0.0, 0.0))
     cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), around, SIZE, SIZE)
     truth, found = field.render(cameras), render_surface(mesh, cameras)
@@ -81,8 +81,8 @@ def test_pictures_of_the_mesh_are_those_of_the_field(mesh, field):
     assert float(psnr(found[:, :3], truth.images).min()) > 24
 
 
-def test_colours_come_from_the_views_where_they_see(mesh, field, views):
-    # The same views painted blue: nearly all of the surface is seen, and is blue then.
+def test_colours_come_from_the_views_that_see_the_surface(mesh, field, views):
+    # If all views are blue, nearly all of the surface is blue, because nearly all of it is seen.
     blue = torch.zeros_like(views.images)
     blue[:, 2] = 1.0
     surface = extract_mesh(field, voxels=24, level=6.0)
@@ -91,8 +91,8 @@ def test_colours_come_from_the_views_where_they_see(mesh, field, views):
     assert mesh.texture[..., 0].std() > 50
 
 
-def test_a_view_fades_out_towards_a_border_that_cuts_the_object(field, monkeypatch):
-    """A red view whose four borders cut the ball, and a blue one from the same place that shows it whole."""
+def test_the_weight_of_a_view_decreases_towards_a_border_that_cuts_the_object(field, monkeypatch):
+    """A red view whose borders cut the ball, and a blue view from the same position that shows all of it."""
     eyes = camera.look_at(torch.tensor([[0.0, 0.0, 3.0]]), (0.0, 0.0, 0.0))
     near, far = (camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, a), eyes, SIZE, SIZE) for a in (0.25, 0.7))
     cameras = camera.concatenate([near, far])
@@ -103,7 +103,7 @@ def test_a_view_fades_out_towards_a_border_that_cuts_the_object(field, monkeypat
 
     def share_between():
         red = texture_surface(surface, blue, support, faces=400, size=128).texture[..., 0] / 255.0
-        assert red.max() > 0.45  # half of it red, where both views see it
+        assert red.max() > 0.45  # half red where both views see it
         return float(((red > 0.05) & (red < 0.4)).mean())
 
     smooth = share_between()
@@ -111,8 +111,8 @@ def test_a_view_fades_out_towards_a_border_that_cuts_the_object(field, monkeypat
     assert share_between() < smooth / 4
 
 
-def test_the_file_opens_with_normals_texture_and_an_unlit_material(mesh, tmp_path):
-    # Source of truth: trimesh's reader, and the JSON part of the file as glTF 2.0 defines it.
+def test_the_file_has_normals_a_texture_and_an_unlit_material(mesh, tmp_path):
+    # Sources of truth: trimesh's reader, and the JSON chunk of the file as defined by glTF 2.0.
     with pytest.raises(ValueError, match="expected a name that ends in glb, got 'ply'"):
         save_textured(mesh, tmp_path / "ball.ply")
     path = save_textured(mesh, tmp_path / "ball.glb")

@@ -12,7 +12,7 @@ def test_encoding_is_its_definition(octaves):
     exact = values.double()
     angles = [exact * 2**octave for octave in range(octaves)]
     expected = torch.cat([exact, *map(torch.sin, angles), *map(torch.cos, angles)], 1)
-    # doubling an angle multiplies its rounding error of 6e-8 by more than 2: 1e-4 after seven times
+    # each doubling of an angle more than doubles its rounding error of 6e-8, to 1e-4 after seven times
     torch.testing.assert_close(encode(values, octaves).double(), expected, atol=2e-4, rtol=0)
     torch.testing.assert_close(encode(exact, octaves), expected, atol=1e-12, rtol=0)
 
@@ -34,7 +34,7 @@ def test_gradients():
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_halves_of_many_octaves_are_rounded_and_no_more(dtype):
+def test_half_precision_with_many_octaves_has_only_rounding_errors(dtype):
     values = torch.tensor([[1.0, 0.3, -1.0]]).to(dtype)
     expected = encode(values.double(), 32)
     torch.testing.assert_close(encode(values, 32).double(), expected, atol=torch.finfo(dtype).eps, rtol=0)

@@ -1,4 +1,4 @@
-"""Source of truth: what must not matter (the order of views, views that see nothing), and the visual hull of a ball."""
+"""Sources of truth: invariances (order of views, views that see nothing), plain PyTorch, and the hull of a ball."""
 
 from dataclasses import asdict, replace
 
@@ -26,7 +26,7 @@ def network(seed=0, config=SMALL):
 
 
 def coloured(count, distance=3.0):
-    """Views of a ball with a pattern on every picture, so that no two views show the same colour."""
+    """Views of a ball with noise in every image, so that no two views show the same colour."""
     views = ball_views(ring(count, SIZE, distance=distance))
     noise = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(3))
     return Views(torch.where(views.masks > 0, 0.5 * views.images + 0.5 * noise, 1.0), views.cameras, views.masks)
@@ -75,7 +75,7 @@ def test_a_view_that_sees_nothing_changes_nothing():
 
 
 @torch.no_grad()
-def test_a_hidden_view_is_as_good_as_absent():
+def test_masking_a_view_is_the_same_as_omitting_it():
     target, views, (points, directions) = network(), coloured(5), queries()
     occupancy = carve(views.masks, views.cameras, views.bounds, 32)
     hidden = target.planes_of(views, occupancy).mask_views(torch.tensor([1, 4]))
@@ -86,7 +86,7 @@ def test_a_hidden_view_is_as_good_as_absent():
 
 
 @torch.no_grad()
-def test_hidden_views_show_nothing_even_where_too_few_others_are_left():
+def test_masked_views_are_not_read_even_if_few_others_are_left():
     target, views, (points, directions) = network(), coloured(3), queries()
     occupancy, hidden = carve(views.masks, views.cameras, views.bounds, 32), torch.tensor([1])
     images = views.images.clone()
@@ -101,8 +101,8 @@ def test_hidden_views_show_nothing_even_where_too_few_others_are_left():
 
 
 @torch.no_grad()
-def test_turning_and_moving_the_world_changes_only_what_reads_world_coordinates():
-    """Points and viewing directions are inputs; depths, coverage, angles and colours are not of any world."""
+def test_a_rotation_of_the_world_changes_only_inputs_in_world_coordinates():
+    """The weights of points and viewing directions are zero; all other inputs do not depend on the world frame."""
     config = ImageBasedConfig(depth=2, width=16, planes=4, blended=2, point_frequencies=0, direction_frequencies=0)
     target, views, (points, directions) = network(config=config), coloured(5), queries()
     parameters = Parameters({name: value.clone() for name, value in Parameters.of(target).items()})
@@ -120,7 +120,7 @@ def test_turning_and_moving_the_world_changes_only_what_reads_world_coordinates(
     cameras = type(views.cameras)(views.cameras.intrinsics, pose, views.cameras.height, views.cameras.width)
     shown = target.planes_of(views, occupancy)
     moved = VisibilityPlanes(views.images, cameras, views.masks, occupancy)
-    moved._maps = shown._maps  # the hull is turned with the world: depths are the same
+    moved._maps = shown._maps  # the hull is rotated with the world, so that depths are the same
     expected = target.bind(parameters, shown)(points, directions)
     found = target.bind(parameters, moved)(points @ turn.T, directions @ turn.T)
     for one, other in zip(found, expected, strict=True):
@@ -128,7 +128,7 @@ def test_turning_and_moving_the_world_changes_only_what_reads_world_coordinates(
 
 
 @torch.no_grad()
-def test_its_first_weights_are_the_visual_hull_in_the_colours_of_the_views():
+def test_the_initial_field_is_the_visual_hull_with_the_colours_of_the_views():
     views, query = ball_views(ring(12, (48, 48))), ball_views(ring(3, (48, 48), shift=1))
     occupancy = carve(views.masks, views.cameras, views.bounds, 64)
     target = network(config=ImageBasedConfig(depth=3, width=32, planes=4))
@@ -151,8 +151,8 @@ def test_density_does_not_depend_on_the_direction_and_colour_does():
 @torch.no_grad()
 @pytest.mark.parametrize("count", [1, 3, 9])
 @pytest.mark.parametrize("grid", [0, 3])
-def test_the_kernel_reads_what_plain_pytorch_does(count, grid, monkeypatch):
-    """Another implementation; points outside the pictures, hidden views and pictures that cut the ball among them."""
+def test_the_kernel_computes_the_same_inputs_as_pytorch(count, grid, monkeypatch):
+    """Another implementation, also for points outside the images, masked views, and images that cut the ball."""
     config = ImageBasedConfig(**{**asdict(SMALL), "grid": grid})
     target, views, (points, directions) = network(config=config), coloured(count), queries()
     parameters = Parameters({name: value.clone() for name, value in Parameters.of(target).items()})
@@ -201,13 +201,13 @@ def test_every_parameter_has_a_gradient():
         assert value.grad.abs().sum() > 0, name
 
 
-def test_no_view_at_all_is_refused():
+def test_no_views_are_refused():
     with pytest.raises(ValueError, match="at least one view"):
         network().bind(Parameters(), None)
 
 
 @torch.no_grad()
-def test_a_field_whose_grid_changes_in_place_says_something_else():
+def test_in_place_changes_of_the_grid_change_the_field():
     target = ImageBasedNeRF(ImageBasedConfig(depth=2, width=64, planes=2, grid=4, cells=4))
     views, parameters = coloured(3), Parameters.of(target)
     field, (points, _) = bound(target, views, parameters), queries()
@@ -222,7 +222,7 @@ def derivatives_of(value, leaf):
     return torch.autograd.grad(value.square().sum(), leaf)[0]
 
 
-def test_directions_are_differentiated_with_points_that_are_not(monkeypatch):
+def test_gradients_of_directions_without_gradients_of_points(monkeypatch):
     field, (points, directions), found = bound(network(), coloured(5)), queries(), []
     for _ in range(2):
         leaf = directions.clone().requires_grad_()
@@ -234,8 +234,8 @@ def test_directions_are_differentiated_with_points_that_are_not(monkeypatch):
         torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")  # of torch.func.jvp
-def test_function_transforms_find_what_autograd_does():
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")  # in torch.func.jvp
+def test_function_transforms_agree_with_autograd():
     target, views, (points, directions) = (
         network(config=ImageBasedConfig(**{**asdict(SMALL), "grid": 3})),
         coloured(4),
@@ -247,7 +247,7 @@ def test_function_transforms_find_what_autograd_does():
     def loss(name):
         def of(value):
             given = {**parameters, name: value} if name else parameters
-            field = bound(target, views, Parameters(given), occupancy)  # with depths of its own
+            field = bound(target, views, Parameters(given), occupancy)  # computes its own depths
             return field(points, directions if name else value)[0].square().sum()
 
         return of
@@ -260,7 +260,7 @@ def test_function_transforms_find_what_autograd_does():
         )
         expected = torch.autograd.grad(loss(name)(leaf), leaf)[0]
         torch.testing.assert_close(torch.func.grad(loss(name))(start), expected, atol=1e-3, rtol=1e-3)
-        if name == "grid.weight":  # PyTorch has no forward derivative of grid_sample: it says so, and drops none
+        if name == "grid.weight":  # PyTorch has no forward derivative of grid_sample
             with pytest.raises(NotImplementedError):
                 torch.func.jvp(loss(name), (start,), (tangent,))
             continue

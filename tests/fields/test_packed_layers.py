@@ -1,4 +1,4 @@
-"""Sources of truth: PyTorch's layers in float64, and properties: neither batches nor threads change a bit."""
+"""Sources of truth: PyTorch's layers in float64, and bitwise independence of batches and threads."""
 
 import copy
 import pickle
@@ -30,7 +30,7 @@ from tests.reference_rendering import ring
 HAS_AMX = compiling.layers_module() == "layers_amx"
 HAS_BFLOAT16 = HAS_AMX or compiling.layers_module(mixed_precision=True) == "layers_bfloat16"
 ERRORS = {"layers": 1e-5, "layers_bfloat16": 5e-2, "layers_amx": 1e-4, "layers_amx_bfloat16": 5e-2}
-"""Kernels, and how far their values may be from those of float64: factors have 8 bits, or 16 by two numbers."""
+"""Kernels and their tolerances relative to float64; factors of bfloat16 kernels have 8 bits, or 16 as two numbers."""
 of_bfloat16 = pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AMX, or AVX512_BF16 of AMD")
 
 
@@ -38,16 +38,16 @@ of_bfloat16 = pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AMX, or AVX512_
     params=[name if name == "layers" else pytest.param(name, marks=of_bfloat16) for name in ERRORS], autouse=True
 )
 def module(request, monkeypatch):
-    """Each kernel; that of AVX-512 is right on every processor, and only used where it is fast.
+    """Each kernel. That for AVX-512 runs on all processors, but is only used by default where it is fast.
 
-    Where there is no AMX, its instructions are emulated.
+    Without AMX, its instructions are emulated.
     """
     use(request.param, monkeypatch)
     return request.param
 
 
 def use(name, monkeypatch):
-    """Multiply layers by the kernel of a module."""
+    """Select the kernel of a module."""
     monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision=False: name)
     if "amx" in name and not HAS_AMX:
         monkeypatch.setattr(packed_layers, "compile_kernel", lambda kernel, dtype: emulated_kernel(kernel))
@@ -85,16 +85,16 @@ def test_values_are_those_of_pytorch(module, depth, width, inputs, count):
 
 @cache
 def few_by_few(module):
-    """Layers that are packed for a kernel, many points, and their values by calls of seven of them each."""
+    """Packed layers, many points, and their values computed in calls of seven points each."""
     layers = PackedLayers.of(layers_of(4, 128, 130, 2), 2)
-    given = torch.randn(1000, 130, generator=torch.Generator().manual_seed(2))  # a part for each thread
+    given = torch.randn(1000, 130, generator=torch.Generator().manual_seed(2))  # enough for a part for each thread
     return layers, given, torch.cat([layers(part) for part in given.split(7)])
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_neither_the_batch_nor_threads_change_a_bit(module, threads, monkeypatch):
+def test_values_do_not_depend_on_batches_and_threads_by_a_bit(module, threads, monkeypatch):
     layers, given, alone = few_by_few(module)
-    monkeypatch.setattr(torch.Tensor, "new_empty", lambda self, *size: self.new_full(size, torch.nan))  # all is written
+    monkeypatch.setattr(torch.Tensor, "new_empty", lambda self, *size: self.new_full(size, torch.nan))  # if unwritten
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -107,8 +107,8 @@ def test_neither_the_batch_nor_threads_change_a_bit(module, threads, monkeypatch
 @of_bfloat16
 @pytest.mark.parametrize("name", ["layers_bfloat16", "layers_amx_bfloat16"])
 @pytest.mark.parametrize(("depth", "inputs"), [(1, 64), (1, 7), (4, 33)])
-def test_mixed_precision_rounds_the_factors_of_products_alone(name, depth, inputs, monkeypatch):
-    """Sums and biases have single precision; a number between two of bfloat16 may become either, layers later."""
+def test_mixed_precision_rounds_only_the_factors_of_products(name, depth, inputs, monkeypatch):
+    """Sums and biases have single precision. Later layers may round values near a tie differently."""
     use(name, monkeypatch)
     layers, given = layers_of(depth, 64, inputs, depth // 2), torch.randn(70, inputs, generator=torch.Generator())
     doubles = [(weight.double(), bias.double()) for weight, bias in layers]
@@ -122,7 +122,7 @@ def test_mixed_precision_rounds_the_factors_of_products_alone(name, depth, input
 
 @of_bfloat16
 @pytest.mark.parametrize("width", [32, 96, 160])
-def test_amx_takes_widths_that_are_no_multiples_of_64(width, monkeypatch):
+def test_amx_supports_widths_that_are_not_multiples_of_64(width, monkeypatch):
     use("layers_amx", monkeypatch)
     layers, given = layers_of(3, width, 35, 1), torch.randn(50, 35, generator=torch.Generator().manual_seed(1))
     expected = by_pytorch([(weight.double(), bias.double()) for weight, bias in layers], given.double(), 1)
@@ -142,7 +142,7 @@ def test_inputs_of_any_layout_are_read():
         assert torch.equal(layers(view), layers(view.contiguous()))
 
 
-def test_nan_of_a_point_stays_with_it():
+def test_nan_of_a_point_does_not_spread_to_others():
     given = torch.zeros(9, 5)
     given[3, 2] = torch.nan
     found = PackedLayers.of(layers_of(2, 64, 5, 1), 1)(given).isnan()
@@ -160,10 +160,10 @@ def test_other_widths_and_precisions_are_left_to_pytorch(module, width, dtype):
     assert PackedLayers.of(layers, 1) is None
 
 
-def test_shapes_that_do_not_go_together_are_left_to_pytorch():
+def test_inconsistent_shapes_are_left_to_pytorch():
     layers = layers_of(3, 64, 5, 1)
     assert PackedLayers.of(layers, 1) is not None
-    assert PackedLayers.of(layers, 2) is None  # the other one reads the inputs
+    assert PackedLayers.of(layers, 2) is None  # another layer reads the inputs
     assert PackedLayers.of([*layers[:2], (layers[2][0], torch.zeros(63))], 1) is None
     packed = PackedLayers.of(layers, 1)
     assert packed.takes(torch.zeros(2, 5))
@@ -178,13 +178,13 @@ def test_shapes_that_do_not_go_together_are_left_to_pytorch():
         (1, True, False, False, (22, 1, 0), {}, ["layers", "layers"]),
         (1, True, False, True, (22, 1, 0), {}, ["layers", "layers_bfloat16"]),
         (1, True, True, True, (22, 1, 0), {}, ["layers_amx", "layers_amx_bfloat16"]),
-        (1, True, True, True, (15, 0, 7), {}, ["layers", "layers"]),  # at the first call of AMX the process ends
-        (1, True, True, True, (22, 1, 0), {"CPU_NAME": "generic"}, ["layers", "layers"]),  # cannot compile it
+        (1, True, True, True, (15, 0, 7), {}, ["layers", "layers"]),  # would crash at the first AMX instruction
+        (1, True, True, True, (22, 1, 0), {"CPU_NAME": "generic"}, ["layers", "layers"]),  # cannot compile AMX
         (1, True, True, True, (22, 1, 0), {"CPU_FEATURES": "+avx2"}, ["layers", "layers"]),
         (1, True, False, True, (22, 1, 0), {"ENABLE_AVX": 0}, ["layers", "layers"]),
     ],
 )
-def test_the_kernel_is_that_of_the_processor_and_the_compiler(  # noqa: PLR0913
+def test_the_kernel_depends_on_the_processor_and_the_compiler(  # noqa: PLR0913
     monkeypatch, found, wide, amx, products, compiler, settings, expected
 ):
     import llvmlite.binding
@@ -201,8 +201,8 @@ def test_the_kernel_is_that_of_the_processor_and_the_compiler(  # noqa: PLR0913
     assert [choose(), choose(mixed_precision=True)] == expected
 
 
-def test_packed_layers_stay_in_their_process():
-    """Another one may have another kernel, and to Linux has to ask for the registers of AMX itself."""
+def test_packed_layers_cannot_be_pickled():
+    """Another process may use another kernel, and must itself request AMX registers from Linux."""
     with pytest.raises(TypeError, match="packed layers: expected to be packed again in each process"):
         pickle.dumps(PackedLayers.of(layers_of(2, 64, 5, 1), 1))
 
@@ -213,7 +213,7 @@ def test_without_a_kernel_layers_are_left_to_pytorch(monkeypatch):
 
 
 def field_of(config):
-    """A field of weights that can be trained."""
+    """A field whose weights require gradients."""
     torch.manual_seed(0)
     network = TARGETS["point_multiplane"](config)
     images = torch.rand(3, 3, 9, 11, generator=torch.Generator().manual_seed(0))
@@ -222,7 +222,7 @@ def field_of(config):
 
 @pytest.fixture
 def used(monkeypatch):
-    """How many points the kernel has taken, call by call."""
+    """The number of points in each call of the kernel."""
     counts, call = [], PackedLayers.__call__
     monkeypatch.setattr(PackedLayers, "__call__", lambda self, given: counts.append(len(given)) or call(self, given))
     return counts
@@ -233,7 +233,7 @@ POINTS = torch.rand(20, 3, generator=torch.Generator().manual_seed(1)) - 0.5
 
 
 def test_a_field_has_the_same_values_with_gradients_and_without(module, used):
-    """With gradients PyTorch multiplies: the same numbers in another order."""
+    """With gradients, PyTorch multiplies the layers, with sums in another order."""
     field, directions = field_of(CONFIG), torch.nn.functional.normalize(POINTS, dim=1)
     learned = field(POINTS, directions)
     learned[0].sum().backward()
@@ -268,7 +268,7 @@ def test_weights_that_change_in_place_change_the_field(used):
 
 
 @torch.no_grad()
-def test_copies_and_pickles_hold_no_packed_weights(used):
+def test_copies_and_pickles_contain_no_packed_weights(used):
     field = field_of(CONFIG)
     expected = field.density(POINTS)
     names = {"target", "parameters", "planes", "bounds", "mixed_precision"}
@@ -280,7 +280,7 @@ def test_copies_and_pickles_hold_no_packed_weights(used):
 
 
 @torch.no_grad()
-def test_pictures_are_in_mixed_precision_unless_told_otherwise_and_values_never(monkeypatch):
+def test_pictures_use_mixed_precision_by_default_and_values_do_not(monkeypatch):
     asked, cameras = [], ring(1, (8, 8))
     monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision=False: mixed_precision)
     monkeypatch.setattr(PackedLayers, "of", lambda *_, mixed_precision: asked.append(mixed_precision))
@@ -295,7 +295,7 @@ def test_pictures_are_in_mixed_precision_unless_told_otherwise_and_values_never(
     def stacked(field):
         return stack(field, field, 0.4)
 
-    assert asked_by(lambda field: [field.render(cameras) for _ in range(2)]) == [True]  # packed once
+    assert asked_by(lambda field: [field.render(cameras) for _ in range(2)]) == [True]  # packed only once
     assert set(asked_by(lambda field: stacked(field).render(cameras))) == {True}
     assert asked_by(lambda field: field.render(cameras, Hierarchical(4, 4)), proposal=field_of(CONFIG)) == [True, True]
     assert asked_by(lambda field: field.render(cameras, mixed_precision=False)) == [False]
@@ -306,7 +306,7 @@ def test_pictures_are_in_mixed_precision_unless_told_otherwise_and_values_never(
     assert asked_by(lambda field: render_guide(field, Views(torch.zeros(1, 3, 8, 8), cameras))) == [False]
 
 
-def test_there_is_no_other_field_where_mixed_precision_is_no_faster(monkeypatch):
+def test_without_a_faster_kernel_the_field_in_mixed_precision_is_the_field_itself(monkeypatch):
     field = field_of(CONFIG)
     assert field.in_mixed_precision is field
     monkeypatch.setattr(packed_layers, "layers_module", lambda mixed_precision=False: mixed_precision)
@@ -334,7 +334,7 @@ def test_the_result_has_the_precision_of_the_inputs_whatever_the_default():
         torch.set_default_dtype(before)
 
 
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # by forward_ad
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # in forward_ad
 @torch.no_grad()
 def test_transforms_traces_and_autocast_go_through_pytorch(module, used, monkeypatch):
     field = field_of(CONFIG)

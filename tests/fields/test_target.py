@@ -1,5 +1,5 @@
-"""Sources of truth: the formula of the MLP point by point, float64 gradcheck, and properties (a delta of zero changes
-nothing, permuted planes with permuted first weights are the same field).
+"""Sources of truth: the formula of the MLP, point by point; float64 gradcheck; and properties (a delta of zero changes
+nothing, permuted planes with permuted weights of the first layer give the same field).
 """
 
 import math
@@ -44,7 +44,7 @@ def target(request):
 
 
 def slow_field(parameters, inputs, direction, config, radius=1.0):
-    """One point by the formulas: an MLP with one skip, a softplus and a sigmoid head."""
+    """Evaluate one point by the formulas: an MLP with a skip connection, and heads with softplus and sigmoid."""
 
     def layer(name, value):
         return parameters[f"{name}.weight"] @ value + parameters[f"{name}.bias"]
@@ -60,7 +60,7 @@ def slow_field(parameters, inputs, direction, config, radius=1.0):
 
 
 @pytest.mark.parametrize("depth", [1, 2, 5])
-def test_the_layers_that_read_a_point_are_those_of_the_trunk_that_are_as_wide_as_its_inputs(depth):
+def test_the_reading_layers_are_those_with_the_point_as_input(depth):
     network = make(config=TargetConfig(depth=depth, width=8, planes=PLANES, point_frequencies=2))
     sizes = {f"layers.{index}": layer.in_features for index, layer in enumerate(network.layers)}
     assert network.reading_layers == tuple(name for name, size in sizes.items() if size >= network.input_size > 8)
@@ -68,7 +68,7 @@ def test_the_layers_that_read_a_point_are_those_of_the_trunk_that_are_as_wide_as
 
 @pytest.mark.parametrize("depth", [1, 2, 5])
 @torch.no_grad()
-def test_a_field_is_its_formula_point_by_point(depth):
+def test_a_field_agrees_with_its_formula(depth):
     config = TargetConfig(depth=depth, width=8, planes=PLANES, point_frequencies=2, direction_frequencies=1)
     network = make(config=config).double()
     images, bounds = planes(dtype=torch.float64), Sphere((0.1, 0.0, -0.2), 1.5)
@@ -107,7 +107,7 @@ def test_density_does_not_depend_on_direction_but_colour_does(target):
 
 @torch.no_grad()
 def test_colours_along_many_directions_are_those_along_each(target):
-    # Source of truth: the colour head asked direction by direction.
+    # Source of truth: the colour head, evaluated for one direction after the other.
     points, directions = queries(7)
     field = target.bind(Parameters.of(target), None if isinstance(target, NeRF) else planes())
     hidden = field.hidden(points)
@@ -132,7 +132,7 @@ def test_delta_of_zero_changes_nothing_and_each_head_only_its_own(target):
 
 @torch.no_grad()
 def test_density_is_per_world_unit():
-    # a scene twice as large, seen from the doubled places: the same colours, half the density
+    # in a scene twice as large, colours at doubled positions are the same, and densities are half
     network, (points, directions) = make("nerf"), queries()
     small = network.bind(Parameters.of(network), None, Sphere((0.1, 0.2, 0.3), 1.0))
     large = network.bind(Parameters.of(network), None, Sphere((0.2, 0.4, 0.6), 2.0))
@@ -155,7 +155,7 @@ def test_gradients_reach_parameters_points_and_directions():
     assert torch.autograd.gradcheck(outputs, inputs)
 
 
-def test_every_parameter_matters(target):
+def test_every_parameter_has_a_gradient(target):
     points, directions = queries(100)
     colour, density = target.bind(Parameters.of(target), planes())(points, directions)
     (colour.sum() + density.sum()).backward()
@@ -169,7 +169,7 @@ def test_another_number_of_planes_is_refused():
         make().bind(Parameters.of(make()), None)(*queries())
 
 
-def test_nerf_looks_at_no_plane():
+def test_nerf_needs_no_planes():
     network = make("nerf")
     field = network.bind(Parameters.of(network), None)
     assert isinstance(network, NeRF)
@@ -183,8 +183,8 @@ def ray_of_one_camera(images, count=6):
 
 
 @torch.no_grad()
-def test_multiplane_sees_only_projections_and_point_multiplane_the_point_too():
-    # all points of a ray through the only plane project onto one pixel
+def test_multiplane_reads_only_projections_and_point_multiplane_also_the_point():
+    # all points on a ray of the only camera project to one pixel
     config = TargetConfig(depth=3, width=16, planes=1, point_frequencies=2)
     images = planes(1)
     points = ray_of_one_camera(images)
@@ -196,7 +196,7 @@ def test_multiplane_sees_only_projections_and_point_multiplane_the_point_too():
 
 
 @torch.no_grad()
-def test_the_planes_are_what_is_looked_up():
+def test_the_field_depends_on_the_images_of_the_planes():
     network, (points, directions) = make(), queries()
     theta = Parameters.of(network)
     one = network.bind(theta, planes(seed=0))(points, directions)[0]
@@ -208,7 +208,7 @@ def test_permuted_planes_with_permuted_first_weights_are_the_same_field():
     network, order = make("multiplane"), torch.tensor([2, 0, 1])
     theta, images = Parameters.of(network), planes()
     shuffled = ImagePlanes(images.images[order], select(ring(PLANES, (9, 11)), order))
-    # inputs are three colours a plane, plane by plane, then two coordinates a plane
+    # inputs are three colours of each plane, then two coordinates of each plane
     colours = 3 * order[:, None] + torch.arange(3)
     columns = torch.cat([colours.flatten(), 3 * PLANES + (2 * order[:, None] + torch.arange(2)).flatten()])
     moved = Parameters(theta)
@@ -222,16 +222,16 @@ def test_permuted_planes_with_permuted_first_weights_are_the_same_field():
 
 
 @torch.no_grad()
-def test_inputs_are_five_numbers_a_plane_within_one():
+def test_inputs_are_five_numbers_per_plane_in_minus_1_to_1():
     network = make("multiplane")
-    far = torch.tensor([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, -50.0, 3.0]])  # seen, beside and behind cameras
+    far = torch.tensor([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, -50.0, 3.0]])
     z = network.inputs(far, planes(), Sphere())
     assert z.shape == (3, 5 * PLANES)
     assert (z.abs() <= 1).all()
 
 
 @torch.no_grad()
-def test_what_no_plane_sees_is_fed_as_background():
+def test_points_outside_all_planes_have_the_background_colour():
     network, images = make("multiplane"), planes()
     far = 50 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
     away = far[~images.lookup(far).valid.any(1)][:1]
@@ -241,36 +241,36 @@ def test_what_no_plane_sees_is_fed_as_background():
     torch.testing.assert_close(z[0, 3 * PLANES :], found.coordinates.flatten())
 
 
-def test_a_hidden_plane_is_five_zeros():
+def test_a_masked_plane_has_five_zeros():
     points, _ = queries()
     target, shown = make("multiplane"), planes()
     before = target.inputs(points, shown, Sphere())
     found = target.inputs(points, shown.mask_views(torch.tensor([1])), Sphere())
-    gone = torch.tensor([3, 4, 5, 9 + 2, 9 + 3])  # three colours a plane, then two coordinates a plane
+    gone = torch.tensor([3, 4, 5, 9 + 2, 9 + 3])  # three colours of each plane, then two coordinates of each plane
     assert before[:, gone].abs().amin() > 0
     assert torch.equal(found[:, gone], torch.zeros(len(points), 5))
     before[:, gone] = 0
     assert torch.equal(found, before)
 
 
-def test_an_abstract_target_says_so():
+def test_an_incomplete_target_is_refused():
     with pytest.raises(TypeError, match="Target does not define input_size"):
         Target(SMALL)
 
 
 @torch.no_grad()
-def test_a_shape_that_no_network_can_have_is_refused():
+def test_impossible_shapes_are_refused():
     with pytest.raises(ValueError, match="width: expected a whole number from 2 to 8192, got 1"):
         replace(SMALL, width=1)
     with pytest.raises(ValueError, match="network.point_frequencies: expected at least 1 for simplified_nerf, got 0"):
         make("simplified_nerf", replace(SMALL, point_frequencies=0))
 
 
-def test_the_simplified_nerf_is_its_formula_point_by_point():
+def test_the_simplified_nerf_agrees_with_its_formula():
     # tancik/learnit: sines and cosines at 2 ** linspace(0, 8, L), layers without a skip connection, ReLU of the density
     config = TargetConfig(depth=3, width=8, point_frequencies=4)
     network, bounds = make("simplified_nerf", config).double(), Sphere((0.1, 0.0, -0.2), 2.0)
-    torch.nn.init.ones_(network.density.bias)  # so that not all of it is cut off
+    torch.nn.init.ones_(network.density.bias)  # so that ReLU does not make all densities zero
     parameters, (points, directions) = Parameters.of(network), queries(dtype=torch.float64)
     colour, density = network.bind(parameters, None, bounds)(points, directions)
     for index, point in enumerate(points):

@@ -1,4 +1,4 @@
-"""The instructions of Intel's AMX that `layers_amx` uses, on other processors: its tile registers lie in memory.
+"""An emulation of the AMX instructions that `layers_amx` uses, with tile registers in memory, for other processors.
 
 Source of truth: the "Tile" and "AMX" instructions of Intel's manual (Software Developer's Manual, volume 2).
 """
@@ -42,7 +42,7 @@ def _store(tiles, tile, target, pitch):
 def _add_products(tiles, total, one, other):
     memory = carray(tiles, 8 * TILE)
     sums = memory[total * TILE : (total + 1) * TILE].view(np.float32)
-    # numbers of bfloat16 are the upper halves of single ones, and two of them one word, the first one below
+    # a bfloat16 is the upper half of a float32; a word holds two of them, the first one in its lower half
     low, high = np.uint32(16), np.uint32(0xFFFF0000)
     left, right = memory[one * TILE : (one + 1) * TILE].view(np.uint32), memory[other * TILE : (other + 1) * TILE]
     right = right.view(np.uint32)
@@ -66,7 +66,7 @@ FUNCTIONS = {
 
 @contextmanager
 def _cache_folder():
-    """While this lasts, numba's folder is that of the kernels' sources and of this file."""
+    """While active, numba's cache folder depends on the sources of the kernels and on this file."""
     name = f"emulated-{hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]}"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(config, "CACHE_DIR", str(Path(compiling._cache_folder()) / name))
@@ -75,7 +75,7 @@ def _cache_folder():
 
 @cache
 def _instructions():
-    """The functions by name, as symbols that kernels call: an address would be that of one process alone."""
+    """The functions by name, registered as symbols, because addresses are valid in only one process."""
     compiled = {name: cfunc(kind, cache=True)(function) for name, (function, kind) in FUNCTIONS.items()}
     for name, function in compiled.items():
         binding.add_symbol(f"emulated_{name}", function.address)
@@ -84,7 +84,7 @@ def _instructions():
 
 @cache
 def emulated_kernel(name):
-    """The function of `compile_kernel(name, torch.float32)`.
+    """An emulated `compile_kernel(name, torch.float32)`.
 
     Args:
         name: "layers_amx.layers" or "layers_amx_bfloat16.layers".
@@ -92,7 +92,7 @@ def emulated_kernel(name):
     registers = {}
 
     def call(builder, name, *arguments):
-        if name not in FUNCTIONS:  # nothing is configured or given back
+        if name not in FUNCTIONS:  # configuring and releasing tiles does nothing
             return
         of_function = builder.function.name
         if of_function not in registers:

@@ -1,6 +1,6 @@
-"""The fuzz campaigns at any length: `make fuzz`, or `python -m tests.fuzz --files 10000 --seed 1`.
+"""Fuzz campaigns of any length: `make fuzz`, or `python -m tests.fuzz --files 10000 --seed 1`.
 
-Beside damaged files, wrong command lines and wrong calls: `python -m tests.fuzz --commands 500 --calls 300`.
+Wrong command lines and wrong calls are tested by `python -m tests.fuzz --commands 500 --calls 300`.
 """
 
 import argparse
@@ -20,14 +20,14 @@ from tests.fuzz.corpus import CORPUS
 
 
 def main():
-    """Run them; the exit code is 1 where something ended as nothing should."""
+    """Run the campaigns. Returns the exit code, which is 1 after any failure."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--files", type=int, default=0, help="how many damaged files")
     parser.add_argument("--commands", type=int, default=0, help="how many command lines")
     parser.add_argument("--calls", type=int, default=0, help="how many calls of public functions")
-    parser.add_argument("--seed", type=int, default=0, help="of all damages")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random choices")
     parser.add_argument("--only", type=int, help="the number of a single case")
-    parser.add_argument("--kinds", nargs="+", choices=CORPUS, help="of files; all when not given")
+    parser.add_argument("--kinds", nargs="+", choices=CORPUS, help="kinds of files; by default all")
     options = parser.parse_args()
     faulthandler.enable()
     home = Path(tempfile.mkdtemp(prefix="hyperplanes-fuzz-"))
@@ -49,7 +49,7 @@ def main():
         print(f"{len(cases)} {name}, seed {options.seed}, {took}: {len(failures)} failures {kinds}", flush=True)
         found += len(failures)
     if found:
-        print(f"what they left is in {home}")
+        print(f"the files of the failures are in {home}")
     else:
         shutil.rmtree(home)
     return int(bool(found))

@@ -1,4 +1,4 @@
-"""Calls of public functions with one argument that is wrong: refused in one line, or answered with finite numbers.
+"""Calls of public functions with one wrong argument have to raise a one-line error or return finite numbers.
 
 Case number i of a seed is always the same: `python -m tests.fuzz --calls 1 --only i --seed SEED`.
 """
@@ -34,17 +34,17 @@ from tests.fuzz.corpus import archive, baked, data_set, posed_scene, small_model
 
 
 def fog(points, directions):
-    """Thin and grey."""
+    """A grey field of low density."""
     return torch.full_like(points, 0.5), torch.ones(len(points))
 
 
 def wall(points, directions):
-    """Opaque and grey."""
+    """A grey field that is opaque."""
     return torch.full_like(points, 0.5), torch.full((len(points),), 1e3)
 
 
 def make_calls(home):
-    """Functions with arguments that are right, by name."""
+    """Functions with valid arguments, by name."""
     posed_scene(home / "scene")
     data_set(home / "data")
     archive(home / "archive")
@@ -146,7 +146,7 @@ def make_calls(home):
 
 
 def wrong_value(value, draw):
-    """Another value than the right one: of another type, shape, or size."""
+    """A value of another type, shape or size than the valid one."""
     if isinstance(value, torch.Tensor) and draw.random() < 0.7:
         return draw.choice(TENSORS)(value)
     if isinstance(value, hp.Views) and draw.random() < 0.6:
@@ -204,12 +204,12 @@ def _numbers(value):
 
 
 def judge_call(function, arguments, finite=True):
-    """What is wrong with how a call ended; None where it was answered, or refused in one line.
+    """The failure of a call, as text; None if it returned a valid result or a one-line error.
 
     Args:
-        function: what is called.
-        arguments: of it, by name.
-        finite: whether the answer is to hold no NaN, as it may where an argument holds some.
+        function: the function.
+        arguments: its arguments by name.
+        finite: whether the result must have no NaN. It may have some if an argument is not finite.
     """
     try:
         with time_limit(), warnings.catch_warnings(), torch.random.fork_rng():
@@ -232,20 +232,20 @@ def judge_call(function, arguments, finite=True):
 
 
 def run_calls(cases, seed, home, report=lambda failure: None):
-    """Failures of these cases, without the type checks of the tests, as users run them.
+    """Run these cases as users do, without the type checks of the tests.
 
     Args:
-        cases: their numbers.
-        seed: of the campaign.
+        cases: numbers of the cases.
+        seed: seed of the campaign.
         home: an empty folder to work in.
-        report: told of each failure when it is found.
+        report: called with each failure when it is found.
 
     Returns:
-        One `Failure` for each call that ended as none should.
+        One `Failure` for each case that failed.
     """
     before, place = jaxtyping.config.jaxtyping_disable, Path.cwd()
     jaxtyping.config.update("jaxtyping_disable", True)
-    os.chdir(home)  # some names are those of this folder
+    os.chdir(home)  # some names are relative to this folder
     try:
         calls, failures = make_calls(home), []
         for name, (function, arguments) in calls.items():

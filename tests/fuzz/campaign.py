@@ -1,4 +1,4 @@
-"""Damage a file, read it, and see that it is read or refused in one line, soon and in little memory.
+"""Damage a file, and check that it is read or refused with a one-line error in a limited time.
 
 Case number i of a seed is always the same: `python -m tests.fuzz --seed SEED --only i` repeats it.
 """
@@ -15,16 +15,16 @@ from hyperplanes.utilities.files import DataError
 from tests.fuzz.corpus import CORPUS
 from tests.fuzz.mutations import mutate
 
-SECONDS = 20  # of processor time, after which a reader counts as hanging
+SECONDS = 20  # of processor time, after which a reader is considered to hang
 
 
 class Hang(BaseException):
-    """A reader that did not come back."""
+    """Raised in a reader after the time limit."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A damaged file that was neither read nor refused as it should be."""
+    """A case that failed, such as a damaged file that was neither read nor refused with a one-line error."""
 
     case: int
     kind: str
@@ -50,7 +50,7 @@ def time_limit():
 
 
 def judge(read, folder):
-    """What is wrong with the answer to this input; nothing where it was read, or refused in one line."""
+    """The failure of reading this input, as text; None if it was read or refused with a one-line error."""
     from data_gen.meshes.files import MeshError
 
     try:
@@ -68,7 +68,7 @@ def judge(read, folder):
 
 
 def prepare(home, kinds=None):
-    """The whole inputs of these kinds, each in a folder of its own, and each checked to be read."""
+    """Write undamaged inputs of these kinds, each to its own folder, and check that each is read."""
     made = {}
     for kind, (make, pattern, read) in CORPUS.items():
         if kinds is not None and kind not in kinds:
@@ -91,17 +91,17 @@ def judge_whole(read, folder):
 
 
 def run_campaign(cases, seed, home: Path, kinds=None, report=lambda failure: None):
-    """Failures of these cases.
+    """Run these cases.
 
     Args:
-        cases: their numbers.
-        seed: of the campaign.
+        cases: numbers of the cases.
+        seed: seed of the campaign.
         home: an empty folder to work in.
-        kinds: of files, as the corpus names them; all when None.
-        report: told of each failure when it is found.
+        kinds: kinds of files, as named in the corpus; all if None.
+        report: called with each failure when it is found.
 
     Returns:
-        One `Failure` for each case that went wrong.
+        One `Failure` for each case that failed.
     """
     made = prepare(home / "whole", kinds)
     failures = []

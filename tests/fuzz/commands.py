@@ -1,8 +1,8 @@
-"""Command lines with something wrong in them, each run in a process of its own.
+"""Command lines with errors in them, each run in its own process.
 
-A line that works gets a few options, drawn from what the verb's dataclass declares, with values that fit or do not.
-Each is to end with exit code 0, 1 or 2, in one line where that is 2, soon, in little memory, and with nothing changed
-of what it reads. Case number i of a seed is always the same: `python -m tests.fuzz --commands 1 --only i --seed SEED`.
+A valid line gets a few random options of the verb's dataclass, with valid or invalid values. Each line has to end with
+exit code 0, 1 or 2, and with a one-line error if it is 2, within limits of time and memory, and without changes to its
+inputs. Case number i of a seed is always the same: `python -m tests.fuzz --commands 1 --only i --seed SEED`.
 """
 
 import faulthandler
@@ -26,9 +26,9 @@ from hyperplanes.utilities.encoding import sha256
 from tests.fuzz.campaign import Failure
 from tests.fuzz.corpus import baked, colmap, data_set, meshes, pictures, posed_scene, settings, small_model
 
-SECONDS = 120  # of processor time, after which a command counts as hanging
-PATIENCE = 400  # seconds of waiting
-MEMORY = 8 * 2**30  # bytes above those of this process
+SECONDS = 120  # of processor time, after which a command is considered to hang
+DEADLINE_SECONDS = 400  # seconds of waiting
+MEMORY = 8 * 2**30  # bytes in addition to those of this process
 
 OUT = "out"
 MODEL = ["--checkpoint", "model", "--views", "scene"]
@@ -48,14 +48,14 @@ LINES = {
     "view": ["nothing", "--port", "0"],
 }
 LONG = {"demo", "view", "reproduce"}
-"""Verbs whose lines end at once for a reason that stands in them, which no option is to take away."""
+"""Verbs that take long. Their lines have an option that ends them at once, which is not replaced."""
 
 POSITIONAL = {("inspect", "path"), ("presets", "name"), ("capture", "photographs"), ("reproduce", "name")}
 
 NUMBERS = ["0", "1", "2", "-1", "2.5", "1e3", "nan", "inf", "-inf", "", "x", "٣", "0x10", "None"]
 LARGE = ["3000", "200000", "2147483648", "99999999999999999999"]
 LASTS = {"steps", "epochs", "frames", "orbit", "fit", "count", "objects", "held_out", "seeds", "views", "supersample"}
-"""Numbers of which a large one means long work, and is not wrong."""
+"""Options for which a large number is valid but takes long."""
 
 PLACES = [
     "model", "scene", "data", "colmap", "mesh", "mesh/a.obj", "empty", "nothing", "nothing/at/all", "", ".",
@@ -69,7 +69,7 @@ SETTINGS = ["model.network.depth", "model.network.width", "training.steps", "tra
 
 
 def prepare_inputs(home):
-    """The files that the lines name, in a folder of their own."""
+    """Write the files that the lines name."""
     posed_scene(home / "scene")
     data_set(home / "data")
     colmap(home / "colmap", binary=True)
@@ -88,7 +88,7 @@ def prepare_inputs(home):
 
 
 def draw_line(draw):
-    """A verb and its options."""
+    """A random verb with options."""
     verb = draw.choice(sorted(LINES))
     line = list(LINES[verb])
     arguments = find_verbs()[verb].load().Arguments
@@ -122,7 +122,7 @@ def draw_line(draw):
 
 
 def _value(name, hint, draw):
-    """One that may fit the annotation of an option; None where it takes none."""
+    """A value that may match the annotation of an option; None for a flag without a value."""
     text = str(hint)
     if hint is bool:
         return None if draw.random() < 0.8 else draw.choice(["True", "x"])
@@ -140,7 +140,7 @@ def _value(name, hint, draw):
 
 
 def _tree(home):
-    """What is there to be read, by its content."""
+    """The checksums of all files of a folder, by path."""
     return {
         str(path.relative_to(home)): sha256(path.read_bytes()) if path.is_file() else ""
         for path in sorted(home.rglob("*"))
@@ -149,7 +149,7 @@ def _tree(home):
 
 
 def _child(line, home, report):
-    """Run one line in this process, which ends with its exit code; 70 where an exception escaped."""
+    """Run one line in this process, and end the process with its exit code, or with 70 after an exception."""
     from hyperplanes.cli import main
 
     with open(report, "w") as told, open(os.devnull) as nothing:
@@ -183,12 +183,12 @@ def _child(line, home, report):
 
 
 def run_line(line, home, report):
-    """What is wrong with how a line ended; None where it ended as it should."""
+    """The failure of a line, as text; None if it ended as expected."""
     sys.stdout.flush()
     child = os.fork()
     if child == 0:
         _child(line, home, report)
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + DEADLINE_SECONDS
     while True:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
@@ -196,7 +196,7 @@ def run_line(line, home, report):
         if time.monotonic() > deadline:
             os.killpg(child, signal.SIGKILL)
             os.waitpid(child, 0)
-            return f"not done after {PATIENCE} s"
+            return f"not done after {DEADLINE_SECONDS} s"
         time.sleep(0.02)
     told = report.read_text(errors="replace")
     if os.WIFSIGNALED(status):
@@ -206,26 +206,26 @@ def run_line(line, home, report):
         return told.strip().splitlines()[-1] if told.strip() else "an exception"
     if code not in (0, 1, 2):
         return f"exit code {code}"
-    complaint = told.strip().splitlines()[-1] if told.strip() else ""
-    refused = complaint.startswith("hyperplanes") or "hyperplanes" in complaint and "--help" in complaint  # tyro's box
+    error_line = told.strip().splitlines()[-1] if told.strip() else ""
+    refused = error_line.startswith("hyperplanes") or "hyperplanes" in error_line and "--help" in error_line  # tyro
     if code == 2 and not refused:
-        return f"exit code 2 with the last line {complaint!r}"
-    if code == 2 and any(word in complaint for word in ("Error:", "object has no attribute", "not supported between")):
-        return f"a line for programmers: {complaint}"
+        return f"exit code 2 with the last line {error_line!r}"
+    if code == 2 and any(word in error_line for word in ("Error:", "object has no attribute", "not supported between")):
+        return f"a line for programmers: {error_line}"
     return None
 
 
 def run_commands(cases, seed, home: Path, report=lambda failure: None):
-    """Failures of these cases.
+    """Run these cases.
 
     Args:
-        cases: their numbers.
-        seed: of the campaign.
+        cases: numbers of the cases.
+        seed: seed of the campaign.
         home: an empty folder to work in.
-        report: told of each failure when it is found.
+        report: called with each failure when it is found.
 
     Returns:
-        One `Failure` for each line that ended as none should.
+        One `Failure` for each line that failed.
     """
     os.environ["HYPERPLANES_CACHE"] = str(home / "cache")
     whole, work = home / "whole", home / "work"

@@ -1,4 +1,4 @@
-"""Small whole inputs of every kind that the project reads, and what reads each of them."""
+"""Small valid inputs of every kind that the project reads, and their readers."""
 
 import json
 import struct
@@ -145,7 +145,7 @@ def published():
 
 
 def progress(folder):
-    """A data set of which one object is finished, and one only noted."""
+    """A data set with one finished object and one that is only listed."""
     with GenerationState(folder, {"count": 2}) as state:
         posed_scene(folder / "a")
         files = {f"a/{path.name}": sha256(path.read_bytes()) for path in (folder / "a").glob("*.json")}
@@ -180,7 +180,7 @@ def settings(folder):
 
 
 def kept(folder):
-    """A field that was adapted to the posed scene beside it."""
+    """A field that was adapted to the posed scene next to it."""
     posed_scene(folder / "scene")
     model, views = small_model(), read_views(folder / "scene")
     keep_field(model, model.adapt(views), folder / "kept" / "a")
@@ -253,7 +253,7 @@ def render_mesh(suffix):
 
 
 def gltf(folder):
-    """A glTF of all that is read of one: morph target, skin, instances, sparse and quantised accessors, textures."""
+    """A glTF with all supported features: morph target, skin, instances, sparse and quantised accessors, textures."""
     folder.mkdir(parents=True)
     Image.fromarray(pictures()[0]).save(folder / "a.png")
     positions = np.array([corner.split() for corner in CORNERS], np.float32)
@@ -332,7 +332,7 @@ DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COL
 
 
 def polygons(folder):
-    """Concave polygons with the colours of faces, smoothing groups and options of textures."""
+    """Concave polygons with colours of faces, smoothing groups and options of textures."""
     folder.mkdir(parents=True)
     (folder / "a.dae").write_text(DAE)
     corners = ["0 0 0", "2 0 0", "1 1 0", "0 2 0", "0 0 1"]
@@ -352,7 +352,7 @@ def read_all(folder):
         data.task(name)
 
 
-CORPUS = {  # how each is made, which of its files are damaged, and what reads it then
+CORPUS = {  # kind: (writer, pattern of the files that are damaged, reader)
     "posed": (posed_scene, "**/*.*", read_task),
     "data set": (data_set, "**/*.*", read_all),
     "manifest": (data_set, "manifest.json", verify),

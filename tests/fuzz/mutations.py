@@ -1,4 +1,4 @@
-"""Damage to files: of their bytes, of numbers and values in their text, of members of their archives."""
+"""Damage to the bytes of files, to numbers and values of texts, and to members of archives."""
 
 import gzip
 import io
@@ -17,7 +17,7 @@ TOKEN = re.compile(rb'-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?|"(?:[^"\\]|\\.)*"|true|fa
 
 
 def flip(data, draw):
-    """Some bits."""
+    """Flip some bits."""
     data = bytearray(data)
     for _ in range(draw.choice([1, 1, 2, 8, 64])):
         data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
@@ -25,31 +25,31 @@ def flip(data, draw):
 
 
 def overwrite(data, draw):
-    """A few bytes by extreme ones, which makes extreme lengths and counts in binary files."""
+    """Overwrite a few bytes with extreme ones, which gives extreme lengths and counts in binary files."""
     at, size = draw.randrange(len(data)), draw.choice([1, 2, 4, 8])
     value = draw.choice([b"\x00", b"\xff", b"\x7f", b"\x80"]) * size
     return data[:at] + value + data[at + size :]
 
 
 def cut(data, draw):
-    """The end, or a part of the middle, away."""
+    """Remove the end, or a part in between."""
     first, second = sorted(draw.randrange(len(data) + 1) for _ in range(2))
     return data[:first] if draw.random() < 0.5 else data[:first] + data[second:]
 
 
 def repeat(data, draw):
-    """A part twice."""
+    """Repeat a part."""
     first, second = sorted(draw.randrange(len(data) + 1) for _ in range(2))
     return data[:second] + data[first:]
 
 
 def empty(data, draw):
-    """Nothing, or nothing but noise."""
+    """Replace all by nothing, by noise, or by one repeated byte."""
     return draw.choice([b"", draw.randbytes(len(data)), b"\0" * len(data), b"\xff\xfe", b"[" * 100_000])
 
 
 def change_value(data, draw):
-    """One value of a text by another, often of another type."""
+    """Replace one value of a text by another, often of another type."""
     tokens = list(TOKEN.finditer(data))
     if not tokens:
         return flip(data, draw) if data else data
@@ -58,7 +58,7 @@ def change_value(data, draw):
 
 
 def change_number(data, draw):
-    """One number of a text by another."""
+    """Replace one number of a text by another."""
     tokens = [token for token in TOKEN.finditer(data) if token[0][:1] in b"-0123456789"]
     if not tokens:
         return overwrite(data, draw) if data else data
@@ -67,7 +67,7 @@ def change_number(data, draw):
 
 
 def change_member(data, draw):
-    """One member of a ZIP archive damaged, encrypted by its flags, or compressed in a way that nobody knows."""
+    """Damage one member of a ZIP archive, or mark it as encrypted or as compressed by an unknown method."""
     if not zipfile.is_zipfile(io.BytesIO(data)):
         return change_value(data, draw)
     way = draw.randrange(3)
@@ -92,7 +92,7 @@ def change_member(data, draw):
 
 
 def change_unpacked(data, draw):
-    """What gzip has packed, damaged as a text."""
+    """Damage the content of a gzip file as a text."""
     try:
         content = gzip.decompress(data)
     except Exception:  # damaged before
@@ -101,7 +101,7 @@ def change_unpacked(data, draw):
 
 
 def change_tensor(data, draw):
-    """One tensor by another of other numbers, shape or type, under a checksum that is right."""
+    """Replace one tensor by one of other numbers, shape or type, with a correct checksum."""
     try:
         tensors = load(data)
     except Exception:  # damaged before
@@ -132,7 +132,7 @@ TEXTS = (".json", ".txt", ".obj", ".off", ".mtl", ".ply", ".gltf", ".dae", ".lst
 
 
 def mutate(data, name, draw):
-    """The content of a file with one to three damages that suit its kind."""
+    """The content of a file after one to three kinds of damage that suit its type."""
     kinds = TEXT if name.endswith(TEXTS) else BINARY
     kinds += {".jgz": (change_unpacked,) * 6, ".safetensors": (change_tensor,) * 6}.get(Path(name).suffix, ())
     for _ in range(draw.choice([1, 1, 1, 2, 3])):

@@ -1,4 +1,4 @@
-"""Whole inputs in the layouts of published data sets and of apps, and a scene as `capture` writes it."""
+"""Valid inputs in the layouts of published data sets and of apps, and a scene as `capture` writes it."""
 
 import gzip
 import json
@@ -15,11 +15,11 @@ FLIP = np.diag([-1.0, -1.0, 1.0])
 
 
 class Published:
-    """Writers of each layout, of the same pictures seen by the same cameras.
+    """Writers of the same pictures and cameras in each layout.
 
     Args:
         pictures: (height, width, 4) pixels.
-        poses: camera_from_world (4, 4), OpenCV axes.
+        poses: camera_from_world (4, 4) with OpenCV axes.
     """
 
     def __init__(self, pictures, poses):
@@ -70,7 +70,7 @@ class Published:
         (home / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
 
     def opengl(self):
-        """world_from_camera (4, 4), x right, y up, z backwards."""
+        """Matrices world_from_camera (4, 4), with x right, y up and z backwards."""
         return [np.linalg.inv(pose) * [1, -1, -1, 1] for pose in self.poses]
 
     def polycam(self, folder):
@@ -120,7 +120,7 @@ class Published:
         )  # fmt: skip
 
     def capture(self, folder):
-        """A scene with its masks and points, the model that it is made of, and the record of a stage."""
+        """Write a scene with its masks and points, the sparse model that it is made of, and the record of a stage."""
         folder.mkdir(parents=True)
         self.save(folder / "scratch/images", "{}.jpg")
         self.save(folder / "scratch/masks", "{}.png", 3)

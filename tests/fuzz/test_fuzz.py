@@ -1,4 +1,4 @@
-"""Property: a damaged file is read or refused in one line; `make fuzz` does the same with 10,000 of them."""
+"""Property: a damaged file is read or refused with a one-line error. `make fuzz` tests 10,000 files."""
 
 from tests.fuzz.campaign import run_campaign
 

@@ -1,4 +1,4 @@
-"""Source of truth: a property: numba unpickles cached machine code, so nobody else may write where it lies."""
+"""Source of truth: a property: numba unpickles cached machine code, so no other user may write to its folder."""
 
 import os
 import time
@@ -18,7 +18,7 @@ def cache_folder(tmp_path, monkeypatch):
     return compiling._cache_folder.__wrapped__
 
 
-def test_the_cache_is_this_users_alone(tmp_path, cache_folder):
+def test_the_cache_belongs_to_this_user_only(tmp_path, cache_folder):
     open_to_all = tmp_path / "hyperplanes"
     open_to_all.mkdir()
     open_to_all.chmod(0o777)
@@ -47,11 +47,11 @@ def test_setup_compiles_every_kernel_without_gradients():
     from hyperplanes.geometry.kernels.compiling import _SIGNATURES, layers_module
 
     used = {f"{layers_module()}.layers", f"{layers_module(mixed_precision=True)}.layers"}
-    others = {name for name in _SIGNATURES if name.startswith("layers")} - used  # of other processors
+    others = {name for name in _SIGNATURES if name.startswith("layers")} - used  # for other processors
     assert set(rendering_kernels()) == {name for name in _SIGNATURES if "backward" not in name} - others
 
 
-def test_threads_that_ask_at_once_compile_once_and_into_the_folder(tmp_path, monkeypatch):
+def test_concurrent_threads_compile_once_and_into_the_folder(tmp_path, monkeypatch):
     import numba
     from numba.core import config
 
@@ -68,7 +68,7 @@ def test_threads_that_ask_at_once_compile_once_and_into_the_folder(tmp_path, mon
     monkeypatch.setattr(compiling, "_cache_folder", lambda: str(tmp_path))
     before = config.CACHE_DIR
     with ThreadPoolExecutor(2) as pool:
-        work = lambda: None  # noqa: E731 - of this test alone: what was compiled is kept
+        work = lambda: None  # noqa: E731 - a new function, since compiled ones are cached
         found = list(pool.map(compiling.compile_function, [work, work]))
     assert found == [work, work]
     assert folders == [str(tmp_path)]

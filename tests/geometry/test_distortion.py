@@ -1,4 +1,4 @@
-"""Lens distortion: OpenCV's projectPoints is the truth."""
+"""Source of truth: OpenCV's projectPoints."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def lenses():
 
 
 @pytest.mark.parametrize("chosen", [False, True])
-def test_lookups_see_through_the_lens_as_opencv_does(chosen):
+def test_lookups_apply_the_lens_as_opencv_does(chosen):
     images = torch.zeros(6, 1, HEIGHT, WIDTH, dtype=torch.float64)
     views = torch.arange(6).flip(0).expand(200, 6) if chosen else None
     found = ImagePlanes(images, lenses()).lookup(some_points(), views)
@@ -45,7 +45,7 @@ def test_lookups_see_through_the_lens_as_opencv_does(chosen):
 
 
 def test_rays_undo_the_lens_as_opencv_does():
-    """OpenCV's `projectPoints` brings each ray back to its pixel: its inverse has other arguments in each release."""
+    """OpenCV's `projectPoints` projects each ray to its pixel; the arguments of its inverse depend on the release."""
     pixels = torch.rand(50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     pixels = pixels * torch.tensor([WIDTH - 1, HEIGHT - 1])
     rays = cast(lenses(), torch.full((50,), 2), pixels)
@@ -54,8 +54,8 @@ def test_rays_undo_the_lens_as_opencv_does():
     np.testing.assert_allclose(again, pixels.numpy(), atol=1e-6)
 
 
-def test_rays_through_strong_lenses_come_back_to_their_pixels():
-    """Property: `distorted_pixels` after the inverse is the identity wherever the inverse says that it is there."""
+def test_rays_through_strong_lenses_are_projected_to_their_pixels():
+    """Property: `distorted_pixels` after the inverse is the identity wherever the inverse is valid."""
     matrix = torch.tensor([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
     bare = cameras.pinhole(matrix, torch.eye(4, dtype=torch.float64)[None], 48, 64)
     pixels = pixel_grid(48, 64).double()
@@ -76,14 +76,14 @@ def test_rays_through_strong_lenses_come_back_to_their_pixels():
 
 
 def test_pixels_beyond_the_fold_have_no_ray():
-    """Closed form: r - r^3 / 3 grows to 2 / 3 at r = 1: no direction is seen farther than 2 / 3 from the centre."""
+    """Closed form: r - r^3 / 3 has its maximum, 2 / 3, at r = 1. Pixels farther from the centre have no ray."""
     matrix = torch.tensor([[10.0, 0.0, 20.0], [0.0, 10.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     bare = cameras.pinhole(matrix, torch.eye(4, dtype=torch.float64)[None], 41, 41)
     ours = distorted(bare, torch.tensor([-1 / 3, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
     pixels = torch.tensor([[20.0, 20.0], [26.6, 20.0], [26.7, 20.0], [0.0, 0.0]], dtype=torch.float64)
     rays = cast(ours, torch.zeros(4, dtype=torch.long), pixels, Sphere((0.0, 0.0, 1.0), 0.9))
     assert (rays.far > rays.near).tolist()[2:] == [False, False]
-    assert rays.directions[3] @ torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64) < 0  # not cast to the other side
+    assert rays.directions[3] @ torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64) < 0  # not on the opposite side
     constant = cast(ours, torch.zeros(4, dtype=torch.long), pixels, near_far="constant")
     assert (constant.far > constant.near).tolist() == [True, True, False, False]
     points = ours.unproject(pixels[None], torch.ones(1, 4, 1, dtype=torch.float64))[0]
@@ -105,7 +105,7 @@ def test_the_inverse_has_the_gradient_of_finite_differences():
 
 
 def test_the_fold_of_the_rational_model():
-    """Brute force: the first place at which the radius stops growing, on a fine grid."""
+    """Brute force: the first radius on a fine grid at which the distorted radius stops growing."""
     lens = (0.3, -0.5, 0.0, 0.0, 0.02, 0.8, 0.1, 0.05)
     radius = torch.linspace(0, 4, 400_001, dtype=torch.float64)
     across = distort(torch.stack([radius, 0 * radius], 1).numpy(), lens)[:, 0]
@@ -113,8 +113,8 @@ def test_the_fold_of_the_rational_model():
     assert float(turning_radius(torch.tensor([lens], dtype=torch.float64))) == pytest.approx(turn, abs=2e-5)
 
 
-def test_cameras_that_are_rebuilt_keep_their_lenses():
-    """An orbit is seen through the lens of the views; poses tried out keep it, and carving says that it cannot."""
+def test_cameras_made_from_others_keep_their_lenses():
+    """Orbits and perturbed poses keep the lens of the views; carving refuses cameras with a lens."""
     views = Views(torch.zeros(6, 3, HEIGHT, WIDTH, dtype=torch.float64), lenses())
     orbit = orbit_cameras(views, 3, size=32)
     assert isinstance(orbit, DistortedCamera)
@@ -130,8 +130,8 @@ def test_cameras_that_are_rebuilt_keep_their_lenses():
     assert cameras.image_size(small) == (7, 9)
 
 
-def test_what_the_polynomial_folds_back_is_not_seen():
-    """Closed form: with k1 = -1/3 alone r - r^3 / 3 turns at r = 1; beyond, points come back towards the middle."""
+def test_points_beyond_the_fold_are_not_valid():
+    """Closed form: with only k1 = -1/3, r - r^3 / 3 decreases beyond r = 1, so that points move back to the centre."""
     matrix = torch.tensor([[10.0, 0.0, 20.0], [0.0, 10.0, 20.0], [0.0, 0.0, 1.0]])
     bare = cameras.pinhole(matrix, torch.eye(4)[None], 41, 41)
     planes = ImagePlanes(torch.zeros(1, 1, 41, 41), distorted(bare, torch.tensor([-1 / 3, 0.0, 0.0, 0.0, 0.0])))
@@ -168,7 +168,7 @@ def test_project_and_unproject_apply_the_lens_as_opencv_does():
     torch.testing.assert_close(again[near], points.expand(6, -1, 3)[near], atol=1e-4, rtol=0)
 
 
-def test_what_a_lens_cannot_show_is_not_projected():
+def test_points_that_the_lens_cannot_show_are_not_projected():
     matrix = torch.tensor([[10.0, 0.0, 20.0], [0.0, 10.0, 20.0], [0.0, 0.0, 1.0]])
     bare = cameras.pinhole(matrix, torch.eye(4)[None], 41, 41)
     ours = distorted(bare, torch.tensor([-1 / 3, 0.0, 0.0, 0.0, 0.0]))
@@ -177,7 +177,7 @@ def test_what_a_lens_cannot_show_is_not_projected():
     assert pixels[1].isnan().all()
 
 
-def test_what_would_lose_the_lens_is_refused():
+def test_operations_that_would_lose_the_lens_are_refused():
     with pytest.raises(ValueError, match=r"scale: .* got a DistortedCamera; use cameras.resized"):
         lenses().scale(torch.tensor([2.0]))
     with pytest.raises(ValueError, match=r"scale: .* use cameras.resized"):
@@ -187,8 +187,8 @@ def test_what_would_lose_the_lens_is_refused():
     assert torch.equal(lenses().clone().distortion, lenses().distortion)
 
 
-def test_pictures_through_a_lens_lose_no_pixel():
-    """Source of truth: every ray of the picture rendered by itself; a strong barrel lens shrinks the ball's image."""
+def test_pictures_through_a_lens_miss_no_pixel():
+    """Source of truth: every ray of the picture rendered alone. A strong barrel lens makes the ball's image smaller."""
     bare = ring(2, (24, 24))
     ours = distorted(bare, torch.tensor([-0.9, 0.5, 0.0, 0.0, 0.0]))
     grid = full(Sphere(), 8)
@@ -205,7 +205,7 @@ def test_pictures_through_a_lens_lose_no_pixel():
     assert (plain.opacity - picture.opacity).abs().max() > 0.9
 
 
-def test_turned_worlds_keep_their_lenses():
+def test_cameras_in_rotated_world_coordinates_keep_their_lenses():
     ours = lenses()
     views = Views(torch.zeros(6, 3, HEIGHT, WIDTH, dtype=torch.float64), ours)
     turned = upright(views, "z").cameras
@@ -217,7 +217,7 @@ def test_turned_worlds_keep_their_lenses():
     )
 
 
-def test_wrong_lenses_are_stopped():
+def test_wrong_lenses_are_refused():
     bare = cameras.pinhole(K, poses(), HEIGHT, WIDTH)
     with pytest.raises(ValueError, match=r"expected shape \(5,\) or \(6, 5\), got \(2, 5\)"):
         distorted(bare, torch.zeros(2, 5))

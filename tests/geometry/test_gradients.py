@@ -1,4 +1,4 @@
-"""Source of truth: finite differences in float64 (gradcheck), through every piece and through the whole renderer."""
+"""Source of truth: finite differences in float64 (gradcheck), of each part and of the whole renderer."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ from hyperplanes.rendering.renderer import Hierarchical, RayMarching, render
 
 
 def small_scene(dtype=torch.float64):
-    """Three 6 x 7 pictures and points that fall inside them, away from pixel boundaries."""
+    """Three 6 x 7 pictures, and points that are projected into them, away from pixel boundaries."""
     generator = torch.Generator().manual_seed(0)
     matrix = torch.tensor([[6.0, 0.0, 3.1], [0.0, 5.0, 2.4], [0.0, 0.0, 1.0]], dtype=dtype)
     pose = cameras.fibonacci_sphere(3, 2.5).to(dtype)
@@ -24,7 +24,7 @@ def small_scene(dtype=torch.float64):
 
 
 def moved(pose, shift):
-    """Poses turned by a small rotation vector and shifted: (view, 6) -> camera_from_world."""
+    """Poses changed by a small rotation vector and a translation: (view, 6) -> camera_from_world."""
     generator = pose.new_zeros(len(pose), 4, 4)
     x, y, z = shift[:, :3].unbind(-1)
     zero = torch.zeros_like(x)
@@ -47,7 +47,7 @@ def grown(matrix, change):
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
 @pytest.mark.parametrize("chosen", [False, True])
 def test_lookup(backend, chosen):
-    """With respect to points, images, intrinsics and extrinsics; the last also near the borders."""
+    """With respect to points, images, intrinsics and extrinsics; for the last, also near the borders."""
     points, matrix, pose, images = small_scene()
     points = torch.cat([points, 4 * points])  # some outside the pictures, some behind the cameras
     views = torch.tensor([[0, 2], [1, 1]]).repeat(5, 1) if chosen else None
@@ -74,7 +74,7 @@ def test_project_and_sample():
 
 
 def test_second_derivatives_of_the_plain_backend():
-    """What MAML needs: also through the images."""
+    """MAML needs them, also with respect to the images."""
     points, matrix, pose, images = small_scene()
     matrices = matrix @ pose[:, :3]
     leaves = (points[:2].requires_grad_(), images.requires_grad_())
@@ -138,7 +138,7 @@ def test_the_whole_renderer(sampling, backend):
             return colour * parameters[0], parameters[1] * torch.exp(-points.square().sum(-1) / parameters[2])
 
         rendered = render(field, rays, sampling, occupancy=full(Sphere(), 4))
-        assert rendered.samples >= 6  # rays meet the sphere, and stay with their samples
+        assert rendered.samples >= 6  # rays intersect the sphere, and keep their samples
         return rendered.colour, rendered.opacity, rendered.depth
 
     parameters = torch.tensor([0.9, 2.0, 0.3], dtype=torch.float64)

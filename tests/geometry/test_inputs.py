@@ -1,4 +1,4 @@
-"""Source of truth: plain PyTorch on the same input, or one sentence that refuses it; nothing leaves its memory."""
+"""Source of truth: plain PyTorch on the same input, or an error message of one sentence; never memory out of bounds."""
 
 import math
 
@@ -29,7 +29,7 @@ def scene(dtype=torch.float32):
 
 
 def pictures(images):
-    """As 8-bit pixels, channels last: what decoders of pictures give."""
+    """Images as 8-bit pixels with channels last, as image decoders return them."""
     return (images * 255).byte().permute(0, 2, 3, 1)
 
 
@@ -77,7 +77,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("action", "message"), WRONG)
-def test_what_cannot_be_computed_is_refused(action, message):
+def test_inputs_that_cannot_be_computed_are_refused(action, message):
     with pytest.raises(ValueError, match=message) as caught:
         action(*scene())
     assert "\n" not in str(caught.value)
@@ -105,14 +105,14 @@ OPERATORS = [
 
 
 @pytest.mark.parametrize(("operator", "arguments", "message"), OPERATORS)
-def test_the_operators_look_before_they_read(operator, arguments, message):
-    """Without these checks each of the calls reads memory of others, most of them up to a segmentation fault."""
+def test_the_operators_check_their_arguments_before_they_read(operator, arguments, message):
+    """Without these checks each call reads out of bounds; most of them end in a segmentation fault."""
     with pytest.raises(ValueError, match=message):
         operator(*arguments(*scene()))
 
 
 def test_numpy_whole_numbers_and_8_bits_are_converted():
-    """Another way to say the same: the float32 tensors that they stand for."""
+    """Source of truth: the equal float32 tensors."""
     _, matrices, images = scene()
     points, eight = torch.tensor([[0, 0, 0], [1, 0, -1]]), (images * 255).round().to(torch.uint8)
     expected = lookup(points.float(), matrices, eight.float() / 255)
@@ -137,8 +137,8 @@ def test_numpy_whole_numbers_and_8_bits_are_converted():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_view_sees_its_own_border_pixels(dtype):
-    """Round trip: points on the rays through pixel centres fall on these pixels and have their colours."""
+def test_points_on_the_rays_of_border_pixels_are_valid(dtype):
+    """Round trip: points on the rays through pixel centres are projected to these pixels and have their colours."""
     generator = torch.Generator().manual_seed(1)
     matrix = cameras.symmetric_intrinsics(48, 64, 0.8)
     ours = cameras.to(cameras.pinhole(matrix, cameras.fibonacci_sphere(20, 3.0), 48, 64), dtype=dtype)
@@ -157,8 +157,8 @@ def test_a_view_sees_its_own_border_pixels(dtype):
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
-def test_a_scene_of_any_size_gives_the_same(size):
-    """Property: lengths scaled by one number leave coordinates and validity as they are."""
+def test_the_scale_of_the_scene_changes_no_lookup(size):
+    """Property: if all lengths are multiplied by one number, coordinates and validity do not change."""
     points, _, images = scene()
     behind = 4 * torch.nn.functional.normalize(points, dim=1)
     points = torch.cat([points, behind])
@@ -173,8 +173,8 @@ def test_a_scene_of_any_size_gives_the_same(size):
 
 
 @pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (1.0, 1.0, 1.0), (2.0, 2.0, -1.0), (0.0, 0.0, 1e-9)])
-def test_looking_along_up_is_a_rotation(up):
-    """Closed form: the third row points at the target, and rows are orthonormal, however up lies."""
+def test_a_camera_that_looks_along_up_has_a_rotation(up):
+    """Closed form: the third row points at the target, and the rows are orthonormal for any direction of up."""
     axis = torch.nn.functional.normalize(torch.tensor(up), dim=0, eps=1e-30)
     pose = cameras.look_at(torch.stack([3 * axis, -3 * axis, torch.tensor([1.0, 2.0, 0.5])]), up=up)
     rotation = pose[:, :3, :3]
@@ -184,9 +184,9 @@ def test_looking_along_up_is_a_rotation(up):
     assert (rotation[2, 1] @ axis) < 0  # rows go down
 
 
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch.func's own
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # raised by torch.func
 def test_forward_mode_and_function_transforms_are_those_of_plain_torch():
-    """Finite differences, and another implementation: the plain backend, which PyTorch differentiates by itself."""
+    """Finite differences, and another implementation: the plain backend, which autograd differentiates."""
     points, matrices, images = scene(torch.float64)
     direction = torch.randn(points.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
@@ -221,7 +221,7 @@ def test_second_derivatives_of_the_default_backend():
 
 
 def test_compiled_in_one_graph(monkeypatch):
-    """Another implementation: eager mode; without checks of annotations, which cannot be traced."""
+    """Another implementation: eager mode. Checks of annotations are off, since they cannot be traced."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     _, _, images = scene()
     planes = ImagePlanes(images, rig(), exact=True)
@@ -240,8 +240,8 @@ def test_compiled_in_one_graph(monkeypatch):
 
 
 @pytest.mark.parametrize("width", [1, 3, 4])
-def test_images_of_several_channels_may_be_as_narrow_as_a_colour(width):
-    """The same columns in a wider image give the same colours; without cameras, dimensions are told by their place."""
+def test_images_of_several_channels_may_be_three_pixels_wide(width):
+    """The same columns in a wider image give the same colours. Without cameras, the order defines the dimensions."""
     points, matrices, _ = scene()
     images = torch.rand(3, 8, 60, width, generator=torch.Generator().manual_seed(0))
     narrow = cameras.cropped(rig(height=60), 60, width)
@@ -252,12 +252,12 @@ def test_images_of_several_channels_may_be_as_narrow_as_a_colour(width):
     assert sample(images, torch.zeros(5, 3, 2)).shape == (5, 3, 8)
 
 
-def test_pixels_of_another_precision_are_those_of_the_cameras():
+def test_pixels_of_another_precision_are_converted_to_that_of_the_cameras():
     view, pixels = torch.zeros(4, dtype=torch.long), pixel_grid(2, 2)
     assert torch.equal(cast(rig(), view, pixels.double()).directions, cast(rig(), view, pixels).directions)
 
 
-def test_poses_of_half_precision_are_checked_as_others_are():
+def test_poses_of_half_precision_are_checked():
     poses = cameras.fibonacci_sphere(3, 2.5)
     assert torch.equal(cameras.with_poses(rig(), poses.half()).extrinsics, poses.half())
     with pytest.raises(ValueError, match="camera_from_world: expected a rotation"):
@@ -272,6 +272,6 @@ def test_poses_of_half_precision_are_checked_as_others_are():
         lambda batch: cameras.moved(batch, [[1.0]]),
     ],
 )
-def test_functions_of_cameras_name_the_argument_that_is_wrong(call):
+def test_functions_of_cameras_name_the_wrong_argument(call):
     with pytest.raises(ValueError, match=r"^(height|motion): expected"):
         call(rig())

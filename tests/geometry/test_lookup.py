@@ -17,7 +17,7 @@ TOLERANCE = {torch.float32: 2e-4, torch.float64: 1e-10}
 
 
 def ring(views=5, height=9, width=13, dtype=torch.float32):
-    """Cameras around the origin with fx != fy, off-centre principal points and skew."""
+    """Cameras around the origin with fx != fy, principal points that are not central, and skew."""
     matrix = torch.tensor([[14.0, 0.3, 5.1], [0.0, 11.0, 4.7], [0.0, 0.0, 1.0]], dtype=dtype)
     return cameras.pinhole(matrix, cameras.fibonacci_sphere(views, 2.5).to(dtype), height, width)
 
@@ -57,7 +57,7 @@ def test_chosen_planes_match_the_loop(backend):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_several_objects_in_one_batch_are_independent(backend):
-    """Property: points of object 0 with its planes and points of object 1 with its own = each alone."""
+    """Property: the lookup of two objects, each with its planes, is equal to the lookups of each alone."""
     points, ours, images = scene(points=64, views=6)
     views = torch.cat([torch.arange(3).expand(32, 3), torch.arange(3, 6).expand(32, 3)])
     together = ImagePlanes(images, ours, backend=backend).lookup(points, views)
@@ -68,7 +68,7 @@ def test_several_objects_in_one_batch_are_independent(backend):
 
 
 def frontal(height=4, width=4, focal=2.0):
-    """A camera at the origin that looks along z, principal point in the middle."""
+    """A camera at the origin that looks along z, with its principal point at the centre."""
     middle = ((width - 1) / 2, (height - 1) / 2)
     matrix = torch.tensor([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
     return cameras.pinhole(matrix, torch.eye(4)[None], height, width)
@@ -76,14 +76,14 @@ def frontal(height=4, width=4, focal=2.0):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_edge_cases_have_the_stated_values(backend):
-    """Closed form: f = 2, c = 1.5, a ramp 0..3 over columns; behind: coordinate 0; outside: clamped."""
+    """Closed form: f = 2, c = 1.5, a ramp 0..3 over columns. Coordinates are 0 behind the camera, clamped outside."""
     ramp = torch.arange(4.0).expand(1, 1, 4, 4).contiguous()
     planes = ImagePlanes(ramp, frontal(), background=9.0, backend=backend)
     cases = [
-        ((0.0, 0.0, 1.0), 1.5, (0.0, 0.0), True),  # the middle
-        ((0.75, 0.75, 1.0), 3.0, (1.0, 1.0), True),  # exactly the last pixel's centre
-        ((-0.75, -0.75, 1.0), 0.0, (-1.0, -1.0), True),  # exactly the first one's
-        ((0.754, 0.0, 1.0), 3.0, (1.0, 0.0), True),  # 0.008 pixels beyond it: rounding
+        ((0.0, 0.0, 1.0), 1.5, (0.0, 0.0), True),  # the centre
+        ((0.75, 0.75, 1.0), 3.0, (1.0, 1.0), True),  # at the centre of the last pixel
+        ((-0.75, -0.75, 1.0), 0.0, (-1.0, -1.0), True),  # at the centre of the first pixel
+        ((0.754, 0.0, 1.0), 3.0, (1.0, 0.0), True),  # 0.008 pixels beyond it: within the tolerance for rounding
         ((0.756, 0.0, 1.0), 9.0, (1.0, 0.0), False),  # 0.012 pixels beyond it: just outside
         ((1e6, -1e6, 1.0), 9.0, (1.0, -1.0), False),  # far outside
         ((0.0, 0.0, -1.0), 9.0, (0.0, 0.0), False),  # behind
@@ -102,7 +102,7 @@ def test_edge_cases_have_the_stated_values(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 5), (5, 1)])
 def test_images_of_one_row_or_column(backend, height, width):
-    """The loop; a single row is hit only by points exactly on it."""
+    """Source of truth: the loop. Only points exactly on a single row are valid."""
     generator = torch.Generator().manual_seed(0)
     images = torch.rand(2, 3, height, width, generator=generator).requires_grad_()
     ours = cameras.concatenate([frontal(height, width), frontal(height, width)])
@@ -118,11 +118,11 @@ def test_images_of_one_row_or_column(backend, height, width):
     np.testing.assert_allclose(found.coordinates.detach().numpy(), coordinates, atol=1e-6)
     np.testing.assert_allclose(found.colours.detach().numpy(), colours, atol=1e-5)
     (gradient,) = torch.autograd.grad(found.colours.sum(), images)
-    assert gradient.sum().item() == pytest.approx(3 * valid.sum(), rel=1e-5)  # every lookup's weights add to 1
+    assert gradient.sum().item() == pytest.approx(3 * valid.sum(), rel=1e-5)  # the weights of each lookup sum to 1
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_no_point_no_view_no_channel(backend):
+def test_there_may_be_no_points_no_views_or_no_channels(backend):
     points, ours, images = scene(points=10)
     planes = ImagePlanes(images, ours, backend=backend)
     assert planes.lookup(points[:0]).colours.shape == (0, 5, 3)
@@ -139,7 +139,7 @@ def test_no_point_no_view_no_channel(backend):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("chosen", [False, True])
 @pytest.mark.parametrize("channels", [2, 3])
-def test_the_kernels_gradients_are_those_of_plain_torch(dtype, chosen, channels):
+def test_the_gradients_of_the_kernels_are_those_of_plain_torch(dtype, chosen, channels):
     """Another implementation: autograd through the torch backend, on smooth images."""
     points, ours, images = scene(points=500, channels=channels, dtype=dtype)
     images = torch.nn.functional.avg_pool2d(images, 5, 1, 2)
@@ -154,7 +154,7 @@ def test_the_kernels_gradients_are_those_of_plain_torch(dtype, chosen, channels)
         results.append(torch.autograd.grad([found.colours, found.coordinates], leaves, pulls))
     for plain, fused in zip(*results, strict=True):
         near = (fused - plain).abs() <= (1e-8 if dtype == torch.float64 else 2e-2) * (1 + plain.abs())
-        assert near.float().mean() > 0.99  # a point on a pixel boundary may fall to either side in float32
+        assert near.float().mean() > 0.99  # in float32, a point on a pixel boundary may round to either side
 
 
 def test_packed_gradients_are_those_of_the_images_they_hold():
@@ -170,8 +170,8 @@ def test_packed_gradients_are_those_of_the_images_they_hold():
     torch.testing.assert_close(results[0][1], results[1][1], atol=1e-4, rtol=1e-4)
 
 
-def test_packed_images_stay_within_the_promise():
-    """Property: 8-bit pictures come out exact, others within 1/512; what does not fit is refused."""
+def test_packed_images_have_the_stated_precision():
+    """Property: 8-bit pictures are exact, others within 1/512; values out of range are refused."""
     images = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
     assert (reference.unpack(pack(images)) - images).abs().max() < 1 / 1024
     eight = (images * 255).round() / 255
@@ -187,7 +187,7 @@ def test_packed_images_stay_within_the_promise():
     torch.testing.assert_close(fast.coordinates, exact.coordinates)
 
 
-def test_images_changed_in_place_are_seen():
+def test_images_changed_in_place_are_looked_up():
     points, ours, images = scene()
     planes = ImagePlanes(images, ours, background=0.0)
     before = planes.lookup(points).colours
@@ -196,7 +196,7 @@ def test_images_changed_in_place_are_seen():
 
 
 def test_lookups_copy_no_images_whatever_their_layout(monkeypatch):
-    """Pictures come as rows of pixels. A copy at every lookup took ten times as long as the lookup itself."""
+    """Decoded pictures have channels last. A copy at every lookup took ten times as long as the lookup itself."""
     points, ours, images = scene()
     by_pixels = images.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
     planes, copied, contiguous = ImagePlanes(by_pixels, ours, exact=True), [], torch.Tensor.contiguous
@@ -233,8 +233,8 @@ def test_directions_and_distances_match_centres():
     assert ImagePlanes(images, ours).lookup(points).directions is None
 
 
-def test_the_operator_passes_torchs_own_checks():
-    """Schema, fake tensor and autograd registration, by torch.library.opcheck."""
+def test_the_operator_passes_opcheck():
+    """torch.library.opcheck tests the schema, the fake tensor and the registration of autograd."""
     from hyperplanes.geometry.kernels import operators
 
     points, ours, images = scene(points=7)
@@ -268,7 +268,7 @@ def test_the_default_follows_device_and_dtype(monkeypatch):
 
 
 @pytest.mark.parametrize("chosen", [False, True])
-def test_hidden_planes_show_no_point_and_the_others_what_they_did(chosen):
+def test_hidden_planes_show_no_point_and_the_others_are_unchanged(chosen):
     points, ours, images = scene()
     planes = ImagePlanes(images, ours, 0.25)
     views = torch.randint(0, 5, (len(points), 3), generator=torch.Generator().manual_seed(0)) if chosen else None
@@ -281,7 +281,7 @@ def test_hidden_planes_show_no_point_and_the_others_what_they_did(chosen):
     assert torch.equal(planes.lookup(points, views).colours, before.colours)
 
 
-def test_other_images_of_the_same_cameras_are_looked_up_where_the_first_are():
+def test_other_images_of_the_same_cameras_have_the_coordinates_of_the_first():
     points, ours, images = scene()
     planes = ImagePlanes(images, ours, 0.25)
     planes.lookup(points)  # packs the first images
@@ -293,7 +293,7 @@ def test_other_images_of_the_same_cameras_are_looked_up_where_the_first_are():
 
 
 @pytest.mark.parametrize("chosen", [False, True])
-def test_no_channel_leaves_the_gradients_of_places(chosen):
+def test_without_channels_coordinates_still_have_gradients(chosen):
     points, ours, images = scene(points=20)
     views = torch.randint(0, 5, (20, 2), generator=torch.Generator().manual_seed(1)) if chosen else None
     found = []
@@ -304,7 +304,7 @@ def test_no_channel_leaves_the_gradients_of_places(chosen):
     torch.testing.assert_close(*found, rtol=1e-3, atol=1e-3)
 
 
-def test_what_does_not_count_its_changes_is_copied():
+def test_tensors_without_a_version_counter_are_copied():
     points, ours, images = scene()
     with torch.inference_mode():
         unseen = images.clone()
@@ -313,7 +313,7 @@ def test_what_does_not_count_its_changes_is_copied():
         unseen.fill_(1.0)
         assert torch.equal(planes.lookup(points).colours, expected)
         eight, last = (255 * images).round().byte(), images.permute(0, 2, 3, 1).contiguous()
-        for other in (eight, last.permute(0, 3, 1, 2)):  # which become other tensors on the way
+        for other in (eight, last.permute(0, 3, 1, 2)):  # which are converted to other tensors
             assert ImagePlanes(other, ours).lookup(points).colours.shape == expected.shape
     array = images.numpy().copy()
     made = [ImagePlanes(array, ours), ImagePlanes(1 - images, ours).with_images(array)]
@@ -323,7 +323,7 @@ def test_what_does_not_count_its_changes_is_copied():
     assert all(torch.equal(*each) for each in zip(before, after, strict=True))
 
 
-def test_a_single_camera_sees_what_is_before_it_wherever_the_origin_is():
+def test_a_single_camera_sees_points_before_it_for_any_origin():
     for far, size in ((0.0, 1.0), (1e3, 1.0), (1e5, 1.0), (1e7, 1.0), (1e-4, 1e-5)):
         eye = torch.tensor([[far, 0.0, 3.0 * size]], dtype=torch.double)
         pose = cameras.look_at(eye, target=(far, 0.0, 0.0)).double()
@@ -333,7 +333,7 @@ def test_a_single_camera_sees_what_is_before_it_wherever_the_origin_is():
         assert planes.lookup(torch.tensor([ahead, behind], dtype=torch.double)).valid[:, 0].tolist() == [True, False]
 
 
-def test_masked_views_and_other_images_have_to_fit():
+def test_masks_and_other_images_need_the_shape_of_the_views():
     points, ours, images = scene()
     planes = ImagePlanes(images, ours)
     for masked in (torch.tensor([1, 3]), [1, 3], [False, True, False, True, False]):
@@ -357,7 +357,7 @@ def test_images_may_be_under_a_transform():
     )
 
 
-def test_other_images_are_read_as_the_first_ones_are():
+def test_other_images_are_converted_as_the_first_are():
     points, ours = scene()[0], cameras.pinhole(cameras.symmetric_intrinsics(9, 13, 0.7), cameras.orbit(5, 3.0), 9, 13)
     bytes_ = torch.randint(256, (5, 2, 9, 13), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     lens = distorted(ours, torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0]))
@@ -368,7 +368,7 @@ def test_other_images_are_read_as_the_first_ones_are():
             assert torch.equal(first.with_images(images).lookup(points).colours, expected)
 
 
-def test_images_that_take_the_place_of_others_are_looked_up():
+def test_images_that_replace_others_are_looked_up():
     points, ours, images = scene()
     planes = ImagePlanes(images, ours)
     before = planes.lookup(points).colours
@@ -378,7 +378,7 @@ def test_images_that_take_the_place_of_others_are_looked_up():
     assert not torch.equal(after, before)
 
 
-def test_at_a_camera_there_is_no_direction_and_its_gradient_is_finite():
+def test_the_direction_at_a_camera_is_zero_with_a_finite_gradient():
     _, ours, images = scene()
     points = cameras.centres(ours).clone().requires_grad_()
     found = ImagePlanes(images, ours).lookup(points, return_directions=True)

@@ -10,11 +10,11 @@ from hyperplanes.geometry.mirror_symmetry import most_symmetric_plane
 from hyperplanes.geometry.occupancy import Occupancy, full
 
 PAIRED = [((0.0, 0.1, 0.4), 0.3), ((0.45, 0.0, -0.3), 0.2), ((0.25, 0.45, 0.1), 0.15)]
-"""Centres and radii on one side of the plane x = 0; the first ball stands in it."""
+"""Centres and radii on one side of the plane x = 0; the centre of the first ball lies in the plane."""
 
 
 def body(azimuth, offset, bounds, side=64):
-    """Voxels in balls and in their mirror images, about a plane whose normal has this azimuth, in radii."""
+    """Voxels in balls and in their mirror images about a plane whose normal has this azimuth. Lengths are in radii."""
     along = torch.tensor([math.cos(azimuth), 0.0, math.sin(azimuth)])
     across = torch.tensor([-math.sin(azimuth), 0.0, math.cos(azimuth)])
     whole = full(bounds, side)
@@ -27,7 +27,7 @@ def body(azimuth, offset, bounds, side=64):
 
 @pytest.mark.parametrize("degrees", [0.0, 31.0, 90.0, 137.3, 179.0])
 @pytest.mark.parametrize("bounds", [Sphere(), Sphere((2.0, -1.0, 0.5), 3.0)])
-def test_the_plane_between_pairs_of_balls_is_found_to_a_fraction_of_a_degree_and_of_a_voxel(degrees, bounds):
+def test_the_plane_of_symmetry_is_found_to_a_fraction_of_a_degree_and_of_a_voxel(degrees, bounds):
     offset = 0.03
     found = most_symmetric_plane(body(math.radians(degrees), offset, bounds))
     normal = torch.tensor(found.normal)
@@ -53,7 +53,7 @@ def test_a_single_voxel_has_a_plane_through_it():
 
 @pytest.mark.parametrize("side", [3, 9, 33])
 def test_a_voxel_at_the_last_border_of_an_odd_grid_has_a_plane_through_it(side):
-    """Blocks of 2 x 2 x 2 voxels leave a slab over there."""
+    """Blocks of 2 x 2 x 2 voxels do not cover that border."""
     one = Occupancy(torch.zeros(side, side, side, dtype=torch.bool), Sphere((0.5, 0.0, -0.2), 2.0))
     one.occupied[-1, side // 2, -1] = True
     found = most_symmetric_plane(one)

@@ -1,4 +1,4 @@
-"""Source of truth: what notebooks show is pictures that any decoder reads, and one line that says how many."""
+"""Source of truth: Pillow decodes the pictures in the HTML; one line states their number."""
 
 import base64
 import io
@@ -15,13 +15,13 @@ from tests.reference_rendering import ball_views, ring, small_model
 
 
 def pictures(html):
-    """The decoded pictures of a piece of HTML that is well-formed but for its single tags."""
+    """The decoded pictures of HTML that is well-formed except for its void tags."""
     ElementTree.fromstring(re.sub(r"<(img [^>]*|br)>", r"<\1/>", html))
     found = re.findall(r"data:image/png;base64,([^\"]+)", html)
     return [np.asarray(Image.open(io.BytesIO(base64.b64decode(each)))) for each in found]
 
 
-def test_views_show_their_pictures_and_say_how_many():
+def test_views_show_their_pictures_and_number():
     views = ball_views(ring(3))
     assert repr(views) == "Views(3 of 16x16, masks)"
     shown = pictures(views._repr_html_())
@@ -31,7 +31,7 @@ def test_views_show_their_pictures_and_say_how_many():
     assert "and 3 more" in ball_views(ring(15))._repr_html_()
 
 
-def test_tasks_planes_and_fields_have_a_line_and_pictures():
+def test_tasks_planes_and_fields_show_a_line_and_pictures():
     views = ball_views(ring(4))
     task = Task(views, views[:2], "<ball>")
     assert repr(task) == "Task('<ball>', support=Views(4 of 16x16, masks), query=Views(2 of 16x16, masks))"

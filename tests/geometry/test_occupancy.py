@@ -1,4 +1,4 @@
-"""Source of truth: a loop (tests/reference.py), and shapes whose pictures are known exactly."""
+"""Source of truth: a loop (tests/reference.py), and shapes with exactly known silhouettes."""
 
 import itertools
 import math
@@ -14,7 +14,7 @@ from tests import reference
 
 
 def pictures(hits, ours, size, centre=(0.0, 0.0, 0.0)):
-    """Exact masks: a pixel is set where `hits(origins, directions)` of the rays through it."""
+    """Exact masks: a pixel is set if `hits(origins, directions)` is true for any of the rays through it."""
     masks = []
     for view in range(ours.batch_size):
         rays = cast(ours, torch.full((size * size,), view), pixel_grid(size, size))
@@ -41,22 +41,22 @@ def box(half):
 @pytest.mark.parametrize("side", [7, 24, 48])
 @pytest.mark.parametrize("shape", ["ball", "box"])
 @pytest.mark.parametrize("size", [9, 40])
-def test_the_hull_never_cuts_the_object(side, shape, size):
-    """Property: every voxel that the object touches is kept, for coarse grids and coarse pictures too."""
+def test_the_hull_contains_the_object(side, shape, size):
+    """Property: every voxel that intersects the object is kept, also for coarse grids and coarse pictures."""
     ours = cameras.pinhole(cameras.symmetric_intrinsics(size, size, 0.9), cameras.fibonacci_sphere(12, 2.7), size, size)
     masks = pictures(ball(0.5) if shape == "ball" else box(0.35), ours, size)
     hull = carve(masks, ours, Sphere(), side)
     points = torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     solid = points.norm(dim=-1) < 0.5 if shape == "ball" else points.abs().amax(-1) < 0.35
     assert hull.contains(points[solid]).all()
-    if side == 48 and size == 40:  # and it is not the whole cube: a ball of radius 0.5 fills 6.5 % of it
+    if side == 48 and size == 40:  # a ball of radius 0.5 fills 6.5 % of the cube
         assert hull.occupied.float().mean() < 0.2
 
 
 @pytest.mark.parametrize("votes", [2, 3])
 @pytest.mark.parametrize("compiled", [True, False])
-def test_as_many_wrong_masks_as_votes_less_one_cut_nothing_off(votes, compiled, monkeypatch):
-    """Property: with masks that are empty by mistake, fewer than votes of them, all of the object is kept."""
+def test_fewer_wrong_masks_than_votes_remove_nothing(votes, compiled, monkeypatch):
+    """Property: if fewer than `votes` masks are empty by mistake, the whole object is kept."""
     if not compiled:
         monkeypatch.setattr(occupancy, "find_spec", lambda name: None)
     ours = cameras.pinhole(cameras.symmetric_intrinsics(30, 30, 0.9), cameras.fibonacci_sphere(12, 2.7), 30, 30)
@@ -71,11 +71,11 @@ def test_as_many_wrong_masks_as_votes_less_one_cut_nothing_off(votes, compiled, 
     ruled = sum(
         (~carve(damaged[[view]], cameras.select(ours, [view]), Sphere(), 20).occupied).int() for view in range(12)
     )
-    torch.testing.assert_close(hull.occupied, ruled < votes)  # brute force: a vote a view
+    torch.testing.assert_close(hull.occupied, ruled < votes)  # brute force: one vote per view
 
 
-def test_an_object_that_the_pictures_cut_off_is_kept():
-    """Property: what a picture does not show, it does not rule out."""
+def test_parts_of_the_object_outside_the_pictures_are_kept():
+    """Property: a picture does not rule out voxels that it does not show."""
     ours = cameras.pinhole(cameras.symmetric_intrinsics(30, 30, 0.3), cameras.fibonacci_sphere(9, 2.7), 30, 30)
     hull = carve(pictures(ball(0.3), ours, 30, (0.35, 0.0, 0.0)), ours, Sphere(), 20)
     points = torch.randn(5000, 3, generator=torch.Generator().manual_seed(0))
@@ -84,8 +84,8 @@ def test_an_object_that_the_pictures_cut_off_is_kept():
     assert hull.occupied.float().mean() < 0.9
 
 
-def test_a_thin_wire_is_kept_wherever_the_masks_show_it():
-    """Property: of a wire without thickness, all is kept whose pixels are set; a pixel that one mask misses is cut."""
+def test_a_line_is_kept_where_all_masks_show_it():
+    """Property: parts of a line are kept if their pixels are set, and removed at a pixel that one mask misses."""
     ours = cameras.pinhole(cameras.symmetric_intrinsics(40, 40, 0.9), cameras.fibonacci_sphere(12, 2.7), 40, 40)
     wire = torch.linspace(-0.6, 0.6, 4000)[:, None] * torch.tensor([[0.7, 0.5, -0.5]])
     pixels = ours.project(wire.expand(12, -1, 3)).round().long()
@@ -103,18 +103,18 @@ def test_a_thin_wire_is_kept_wherever_the_masks_show_it():
     assert not cut[~hidden].any()
 
 
-def test_the_compiled_hull_is_the_plain_one(monkeypatch):
+def test_the_kernel_and_plain_pytorch_carve_the_same_hull(monkeypatch):
     ours = cameras.pinhole(cameras.symmetric_intrinsics(33, 33, 0.8), cameras.fibonacci_sphere(7, 2.2), 33, 33)
     masks = pictures(box(0.4), ours, 33, (0.1, 0.0, -0.1))
     fast = carve(masks, ours, Sphere((0.05, 0.0, 0.0), 0.9), 30).occupied
     monkeypatch.setattr("hyperplanes.geometry.occupancy.find_spec", lambda name: None)
     plain = carve(masks, ours, Sphere((0.05, 0.0, 0.0), 0.9), 30).occupied
-    assert (fast != plain).float().mean() < 1e-3  # rounding may decide a voxel on the edge of a pixel
+    assert (fast != plain).float().mean() < 1e-3  # rounding may decide about a voxel at the edge of a pixel
     assert 0.05 < plain.float().mean() < 0.5
 
 
-def test_the_hull_is_no_larger_than_the_loops():
-    """The loop's footprint is a little larger than needed, so its hull holds ours."""
+def test_the_hull_is_within_that_of_the_loop():
+    """The loop uses a slightly larger footprint of a voxel, so its hull contains that of the product."""
     ours = cameras.pinhole(cameras.symmetric_intrinsics(24, 24, 0.9), cameras.fibonacci_sphere(6, 2.7), 24, 24)
     masks = pictures(ball(0.4), ours, 24, (0.1, -0.2, 0.0))
     hull = carve(masks, ours, Sphere(), 10)
@@ -136,7 +136,7 @@ def test_the_hull_does_not_depend_on_the_order_of_views():
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_views_can_be_carved_one_after_the_other(compiled, monkeypatch):
+def test_views_can_be_carved_one_by_one(compiled, monkeypatch):
     ours = cameras.pinhole(cameras.symmetric_intrinsics(20, 20, 0.9), cameras.fibonacci_sphere(8, 2.7), 20, 20)
     masks = pictures(box(0.4), ours, 20)
     if not compiled:
@@ -149,7 +149,7 @@ def test_views_can_be_carved_one_after_the_other(compiled, monkeypatch):
     assert torch.equal(first.occupied, before)
 
 
-def test_no_view_keeps_everything_and_empty_masks_what_no_camera_sees():
+def test_without_views_all_is_kept_and_empty_masks_keep_what_no_camera_sees():
     ours = cameras.pinhole(cameras.symmetric_intrinsics(20, 20, 0.3), cameras.orbit(2, 2.7), 20, 20)
     assert carve(torch.zeros(0, 1, 20, 20), cameras.select(ours, []), Sphere(), 8).occupied.all()
     hull = carve(torch.zeros(2, 1, 20, 20), ours, Sphere(), 8)
@@ -158,7 +158,7 @@ def test_no_view_keeps_everything_and_empty_masks_what_no_camera_sees():
 
 
 def test_contains_and_centres_agree():
-    """Closed form: a grid of side 2 over [-1, 1]^3 with only the voxel of positive x, y and negative z set."""
+    """Closed form: a grid of side 2 over [-1, 1]^3 where only the voxel with x > 0, y > 0, z < 0 is set."""
     occupied = torch.zeros(2, 2, 2, dtype=torch.bool)
     occupied[1, 1, 0] = True
     grid = Occupancy(occupied, Sphere((1.0, 0.0, 0.0), 2.0))
@@ -180,7 +180,7 @@ def test_the_surface_has_a_face_at_an_empty_voxel_or_at_the_border():
 
 
 @pytest.mark.parametrize("side", [4, 5])
-def test_an_odd_grid_gets_one_more_voxel_and_keeps_the_places_of_the_others(side):
+def test_an_odd_grid_gets_one_more_voxel_and_the_others_keep_their_positions(side):
     bounds = Sphere((0.5, -1.0, 0.0), 2.0)
     grid = Occupancy(torch.rand(side, side, side, generator=torch.Generator().manual_seed(0)) < 0.4, bounds)
     even = grid.with_even_side()
@@ -188,7 +188,7 @@ def test_an_odd_grid_gets_one_more_voxel_and_keeps_the_places_of_the_others(side
     torch.testing.assert_close(even.centres(), grid.centres())
 
 
-def test_what_is_known_of_voxels_follows_their_changes():
+def test_values_computed_from_voxels_follow_changes_of_the_voxels():
     grid = Occupancy(torch.zeros(32, 32, 32, dtype=torch.bool), Sphere())
     for reach in (4, 12):
         grid.occupied[16 - reach : 16 + reach, 10:20, 10:20] = True
@@ -202,6 +202,6 @@ def test_what_is_known_of_voxels_follows_their_changes():
     "voxels", [torch.ones(4, 4, 4), torch.ones(4, 2, 2).bool(), torch.ones(0, 0, 0).bool(), torch.ones(4, 4).bool()]
 )
 def test_a_grid_is_a_cube_of_booleans(voxels):
-    """The kernels read it as one."""
+    """The kernels assume that."""
     with pytest.raises(ValueError, match=r"occupied: expected booleans \(side, side, side\), got"):
         Occupancy(voxels, Sphere())

@@ -1,4 +1,4 @@
-"""Source of truth: cameras that are wrong by a known amount, which the example, made small, finds again."""
+"""Source of truth: cameras with a known perturbation, which the example removes, at a small size."""
 
 import importlib.util
 import sys
@@ -11,19 +11,19 @@ from hyperplanes.geometry import cameras
 PATH = Path(__file__).resolve().parents[2] / "examples" / "refine_cameras.py"
 SPECIFICATION = importlib.util.spec_from_file_location("refine_cameras", PATH)
 example = importlib.util.module_from_spec(SPECIFICATION)
-sys.modules["refine_cameras"] = example  # dataclasses look their module up
+sys.modules["refine_cameras"] = example  # dataclasses look up their module
 SPECIFICATION.loader.exec_module(example)
 
 
 def test_perturbations_have_the_stated_size():
-    """Closed form: turned by 5 to 10 degrees, moved by 2.5 to 5 % of the distance."""
+    """Closed form: rotations of 5 to 10 degrees, translations of 2.5 to 5 % of the distance."""
     true = cameras.fibonacci_sphere(20, 2.7)
     degrees, percent = example.errors(example.perturbed(true, 10.0, 0.05, 0), true)
     assert ((degrees > 4.99) & (degrees < 10.01)).all()
     assert ((percent > 2.49) & (percent < 5.01)).all()
 
 
-def test_wrong_cameras_are_found_again():
+def test_perturbed_cameras_are_corrected():
     scene, true = example.Blobs.make(), cameras.fibonacci_sphere(2, 2.7, -0.5, 0.8)
     start = example.perturbed(true, 5.0, 0.03, 1)
     result = example.refine(scene, start, true, 24, 160)

@@ -1,4 +1,4 @@
-"""Source of truth: the mirror image of a point about a plane, and where two cameras show both."""
+"""Source of truth: the mirror image of a point about a plane, and the pixels of both in two cameras."""
 
 import math
 
@@ -15,7 +15,7 @@ TILTED = Plane((0.6, 0.0, -0.8), 0.3)
 
 
 def slanted(*, lens=False):
-    """Cameras whose principal point lies to one side, with a lens or with slanted pixels."""
+    """Cameras whose principal point is not central, with a lens or with skew."""
     cameras = ring(4, SIZE)
     cameras.intrinsics[:, 0, 2] = 8.0
     if lens:
@@ -59,8 +59,8 @@ def test_a_plane_has_a_normal_of_length_1_and_a_finite_offset(plane):
         Plane(*plane)
 
 
-def test_the_rotations_of_a_symmetry_and_its_reflection_make_a_group():
-    """Each product of two is one of them: rotations, and the reflections about its planes."""
+def test_the_rotations_and_reflections_of_a_symmetry_are_a_group():
+    """The product of any two of the rotations and reflections is one of them."""
     symmetry = Symmetry(TILTED, 3, (0.5, 7.0, 0.0))
     rotations = symmetry.rotations
     torch.testing.assert_close(rotations[0], torch.eye(4).double())
@@ -74,7 +74,7 @@ def test_the_rotations_of_a_symmetry_and_its_reflection_make_a_group():
     torch.testing.assert_close(group @ on_axis, on_axis.expand(6, 4))
 
 
-def test_by_a_quarter_turn_the_z_axis_is_mapped_onto_the_x_axis():
+def test_a_quarter_turn_maps_the_z_axis_to_the_x_axis():
     turned = Symmetry(Plane((1.0, 0.0, 0.0)), 4).rotations[1] @ torch.tensor([0.0, 0.0, 1.0, 1.0]).double()
     torch.testing.assert_close(turned, torch.tensor([1.0, 0.0, 0.0, 1.0]).double())
 
@@ -87,12 +87,12 @@ def test_by_a_quarter_turn_the_z_axis_is_mapped_onto_the_x_axis():
         (Plane((1.0, 0.0, 0.0), 0.1), 2, "symmetry: expected a vertical plane through the axis"),
     ],
 )
-def test_several_planes_are_vertical_and_meet_in_the_axis(plane, order, message):
+def test_several_planes_have_to_be_vertical_and_contain_the_axis(plane, order, message):
     with pytest.raises(ValueError, match=message):
         Symmetry(plane, order)
 
 
-def test_poses_are_differentiated_through():
+def test_reflections_have_gradients_of_the_poses():
     cameras = ring(3, SIZE)
     pose = camera_from_world(cameras).clone().requires_grad_()
     cameras = with_poses(cameras, pose)
@@ -100,5 +100,5 @@ def test_poses_are_differentiated_through():
     heights = [(centres(each) @ normal).sum() for each in (cameras, reflected_cameras(cameras, TILTED))]
     own, reflected = (torch.autograd.grad(each, pose, retain_graph=True)[0] for each in heights)
     assert own[:, :3, 3].abs().sum() > 0.1
-    # a camera that moves towards the plane has a mirror image that moves towards it from the other side
+    # if a camera moves towards the plane, its mirror image moves towards it from the opposite side
     torch.testing.assert_close(reflected[:, :3, 3], -own[:, :3, 3], atol=1e-5, rtol=0)

@@ -17,7 +17,7 @@ from tests import reference
 
 BACKENDS = ["torch", "cpu"]
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
-SIZES = [(9, 13), (41, 50)]  # 300 points on the first are enough for a copy of the plane to pay, on the second not
+SIZES = [(9, 13), (41, 50)]  # for 300 points, the plane is copied at the first size only
 
 
 def scene(points=300, views=4, channels=3, size=(9, 13), dtype=torch.float32, reach=1.0):
@@ -33,7 +33,7 @@ def scene(points=300, views=4, channels=3, size=(9, 13), dtype=torch.float32, re
 @pytest.mark.parametrize("channels", [1, 3, 4])
 @pytest.mark.parametrize("size", SIZES)
 def test_colours_are_those_of_map_coordinates(backend, dtype, channels, size):
-    """Another implementation, inside and outside: a constant beyond the borders, without blending."""
+    """Another implementation, inside and outside; beyond the borders there is a constant, without blending."""
     images, coordinates = scene(channels=channels, size=size, dtype=dtype, reach=1.3)
     found = sample(images, coordinates, background=0.25, backend=backend).numpy()
     last = np.array([size[1] - 1, size[0] - 1])
@@ -67,7 +67,7 @@ def test_values_and_gradients_inside_are_those_of_grid_sample(backend, size):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("channels", [1, 3])
 def test_edge_cases_have_the_stated_values(backend, channels):
-    """Closed form: a ramp 0..3 over columns; the borders belong to the image, what is beyond is background."""
+    """Closed form: a ramp 0..3 over columns. The borders belong to the image; beyond them is the background."""
     ramp = torch.arange(4.0).expand(1, channels, 4, 4)
     beyond = 1 + 1e-5
     cases = [
@@ -90,14 +90,14 @@ def test_edge_cases_have_the_stated_values(backend, channels):
     assert found.flatten(1).mean(1).tolist() == pytest.approx([case[1] for case in cases], abs=1e-6)
     (gradient,) = torch.autograd.grad(found.sum(), coordinates)
     expected = [[1.5 * channels if colour == 1.5 else 0.0, 0.0] for _, colour in cases]
-    inner = [0, *range(4, len(cases))]  # at a pixel's centre and on the border the slope is that of either side
+    inner = [0, *range(4, len(cases))]  # at pixel centres and borders the derivative is one-sided
     assert gradient[inner, 0].tolist() == [expected[index] for index in inner]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 5), (5, 1)])
 def test_images_of_one_row_or_column(backend, height, width):
-    """Closed form: along an axis of one pixel, all coordinates are that pixel."""
+    """Closed form: along an axis of one pixel, all coordinates refer to that pixel."""
     images = torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     _, coordinates = scene(points=200, views=2, dtype=torch.float64)
     leaf = images.clone().requires_grad_()
@@ -106,10 +106,10 @@ def test_images_of_one_row_or_column(backend, height, width):
     wide = wide.repeat_interleave(2, 3) if height == width else wide
     torch.testing.assert_close(found, sample(wide, coordinates, backend="torch"))
     (gradient,) = torch.autograd.grad(found.sum(), leaf)
-    assert gradient.sum().item() == pytest.approx(200 * 2 * 3)  # every point's weights add to 1
+    assert gradient.sum().item() == pytest.approx(200 * 2 * 3)  # the weights of each point sum to 1
 
 
-def test_every_layout_of_the_coordinates_gives_the_same():
+def test_coordinates_of_any_layout_give_the_same():
     images, coordinates = scene(points=1000, reach=1.1)
     expected = sample(images, coordinates)
     pairs = coordinates.transpose(0, 1).contiguous().transpose(0, 1)
@@ -128,8 +128,8 @@ def test_every_layout_of_the_coordinates_gives_the_same():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("channels", [2, 3])
 @pytest.mark.parametrize("size", SIZES)
-def test_the_kernels_gradients_are_those_of_plain_torch(dtype, channels, size):
-    """Another implementation: autograd through the torch backend, on smooth images; each input by itself too."""
+def test_the_gradients_of_the_kernels_are_those_of_plain_torch(dtype, channels, size):
+    """Another implementation: autograd through the torch backend, on smooth images; also of each input alone."""
     images, coordinates = scene(channels=channels, size=size, dtype=dtype, reach=1.2)
     images = avg_pool2d(images, 5, 1, 2)
     pull = torch.randn(300, 4, channels, generator=torch.Generator().manual_seed(2), dtype=dtype)
@@ -142,13 +142,13 @@ def test_the_kernels_gradients_are_those_of_plain_torch(dtype, channels, size):
     for wanted in ((True, True), (True, False), (False, True)):
         for plain, fused in zip(gradients("torch", wanted), gradients("cpu", wanted), strict=True):
             near = (fused - plain).abs() <= (1e-10 if dtype == torch.float64 else 2e-2) * (1 + plain.abs())
-            assert near.float().mean() > 0.99  # a point on a pixel boundary may fall to either side in float32
+            assert near.float().mean() > 0.99  # in float32, a point on a pixel boundary may round to either side
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("size", [(6, 7), (20, 24)])
 def test_gradients_are_those_of_finite_differences(backend, size):
-    """In float64; points outside have none."""
+    """In float64. Points outside have no gradient."""
     images, coordinates = scene(points=10, views=2, size=size, dtype=torch.float64, reach=1.2)
     leaves = images.requires_grad_(), coordinates.requires_grad_()
     assert gradcheck(lambda i, c: sample(i, c, backend=backend), leaves, fast_mode=size != (6, 7))
@@ -173,15 +173,15 @@ def test_packed_images_are_sampled_as_the_images_they_hold(eight_bits):
         results.append((found, torch.autograd.grad(found.square().sum(), leaf)[0]))
     torch.testing.assert_close(results[0][0], results[1][0], atol=1e-6, rtol=0)
     torch.testing.assert_close(results[0][1], results[1][1], atol=1e-4, rtol=1e-4)
-    # what packed images cannot serve, the images themselves do
+    # the images themselves are read where packed ones cannot be
     double = sample(images.double(), coordinates.double(), packed=packed)
     torch.testing.assert_close(double, sample(images.double(), coordinates.double()), atol=0, rtol=0)
     live = images.clone().requires_grad_()
     assert torch.autograd.grad(sample(live, coordinates, packed=packed).sum(), live)[0].abs().sum() > 0
 
 
-def test_the_lookups_colours_are_samples_at_its_coordinates():
-    """Property: the lookup = project, then sample."""
+def test_the_colours_of_a_lookup_are_samples_at_its_coordinates():
+    """Property: a lookup is a projection and then a sampling."""
     images, _ = scene()
     matrix = torch.tensor([[14.0, 0.3, 5.1], [0.0, 11.0, 4.7], [0.0, 0.0, 1.0]])
     ours = cameras.pinhole(matrix, cameras.fibonacci_sphere(4, 2.5), 9, 13)
@@ -193,7 +193,7 @@ def test_the_lookups_colours_are_samples_at_its_coordinates():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_no_point_no_view_no_channel(backend):
+def test_there_may_be_no_points_no_views_or_no_channels(backend):
     images, coordinates = scene(points=10)
     for ours, where in ((images, coordinates[:0]), (images[:0], coordinates[:, :0]), (images[:, :0], coordinates)):
         leaves = ours.clone().requires_grad_(), where.clone().requires_grad_()
@@ -206,7 +206,7 @@ def test_no_point_no_view_no_channel(backend):
         assert not value.any()
 
 
-def test_the_result_does_not_depend_on_the_threads():
+def test_the_result_does_not_depend_on_the_number_of_threads():
     images, coordinates = scene(points=20_000)
     before = torch.get_num_threads()
     results = []
@@ -223,8 +223,8 @@ def test_the_result_does_not_depend_on_the_threads():
         torch.testing.assert_close(other[1:], results[0][1:], atol=1e-3, rtol=1e-5)
 
 
-def test_the_operator_passes_torchs_own_checks():
-    """Schema, fake tensor and autograd registration, by torch.library.opcheck."""
+def test_the_operator_passes_opcheck():
+    """torch.library.opcheck tests the schema, the fake tensor and the registration of autograd."""
     from hyperplanes.geometry.kernels import operators
 
     images, coordinates = scene(points=7)
@@ -239,7 +239,7 @@ def test_the_operator_passes_torchs_own_checks():
 
 
 def test_compiled_code_gives_the_same():
-    """Another implementation: eager mode. One graph with gradients; shape checks would not trace."""
+    """Another implementation: eager mode. One graph with gradients, without untraceable checks of shapes."""
     from hyperplanes.geometry.kernels import operators
 
     images, coordinates = scene(points=50)
@@ -257,7 +257,7 @@ def test_compiled_code_gives_the_same():
 def test_wrong_arguments_are_named(monkeypatch):
     images, coordinates = scene(points=4)
     with pytest.raises(ValueError, match=r"coordinates: expected shape \(point, 4, 2\).* got \(4, 3, 2\)"):
-        inspect.unwrap(sample)(images, coordinates[:, :3])  # the tests' own check of shapes would come first
+        inspect.unwrap(sample)(images, coordinates[:, :3])  # without the tests' check of shapes
     with pytest.raises(ValueError, match="backend: expected torch or cpu for float32 on cpu, got 'triton'"):
         sample(images, coordinates, backend="triton")
     monkeypatch.setitem(_INSTALLED, "numba", False)

@@ -1,4 +1,4 @@
-"""Source of truth: one thread: any number of them, several at once and a forked process give the same."""
+"""Source of truth: one thread. More threads, simultaneous calls and a forked process give the same results."""
 
 import importlib
 import os
@@ -41,7 +41,7 @@ def three_threads():
     torch.set_num_threads(before)
 
 
-def test_parts_of_parallel_map_run_alone_without_gradients_and_in_order(three_threads):
+def test_parts_of_parallel_map_use_one_thread_each_without_gradients_and_in_order(three_threads):
     weight = torch.ones(1, requires_grad=True)
     ran = []
 
@@ -53,14 +53,14 @@ def test_parts_of_parallel_map_run_alone_without_gradients_and_in_order(three_th
     assert {state[1:] for state in ran} == {(1, False)}
     assert threading.get_ident() not in {state[0] for state in ran}
     assert torch.get_num_threads() == 3
-    born = []  # a thread that begins afterwards has as many as were set
+    born = []  # a thread that starts afterwards has the number that was set
     thread = threading.Thread(target=lambda: born.append(torch.get_num_threads()))
     thread.start()
     thread.join()
     assert born == [3]
 
 
-def test_an_error_in_a_part_is_raised_and_the_parts_after_it_are_left_out(three_threads):
+def test_an_error_in_a_part_is_raised_and_later_parts_do_not_run(three_threads):
     ran = []
 
     def work(part):
@@ -76,7 +76,7 @@ def test_an_error_in_a_part_is_raised_and_the_parts_after_it_are_left_out(three_
 CPU = torch.device("cpu")
 
 
-def test_two_computations_at_once_wait_for_each_other(three_threads):
+def test_two_computations_run_concurrently(three_threads):
     barrier = threading.Barrier(2, timeout=20)
 
     def work(name):
@@ -87,7 +87,7 @@ def test_two_computations_at_once_wait_for_each_other(three_threads):
         assert at_once(lambda: work("one"), lambda: work("other"), CPU) == (("one", 10, False), ("other", 10, False))
 
 
-def test_two_computations_follow_each_other_where_there_is_one_thread_or_two_run_already(three_threads):
+def test_two_computations_run_in_turn_with_one_thread_or_where_two_run_already(three_threads):
     def ran():
         return threading.get_ident()
 
@@ -100,7 +100,7 @@ def test_two_computations_follow_each_other_where_there_is_one_thread_or_two_run
 
 
 @pytest.mark.parametrize("count", [2, 5, 3])
-def test_both_of_two_computations_have_as_many_threads_as_are_set(count, three_threads):
+def test_both_of_two_computations_have_the_number_of_threads_that_is_set(count, three_threads):
     torch.set_num_threads(count)
     state = at_once(*2 * [lambda: (torch.get_num_threads(), torch.is_grad_enabled())], CPU)
     assert state == ((count, False), (count, False))
@@ -125,8 +125,8 @@ def test_an_error_in_one_of_two_computations_is_raised_when_both_have_ended(wron
 
 
 @pytest.mark.parametrize(("size", "exact"), [(8, False), (8, True), (150, True)])
-def test_the_result_does_not_depend_on_the_threads(size, exact):
-    """Nor on how planes are read: of 150 x 150 pixels, one thread interleaves them for its points, three do not."""
+def test_the_result_does_not_depend_on_the_number_of_threads(size, exact):
+    """Nor on how planes are read. At 150 x 150 pixels, one thread interleaves them for its points; three do not."""
     before = torch.get_num_threads()
     try:
         results = []
@@ -138,10 +138,10 @@ def test_the_result_does_not_depend_on_the_threads(size, exact):
     assert all(torch.equal(results[0], result) for result in results)
 
 
-def test_all_that_a_kernel_calls_is_inlined():
-    """What is not is bound to the copy of whichever kernel was compiled or loaded first (numba 0.68).
+def test_all_functions_that_a_kernel_calls_are_inlined():
+    """A function that is not inlined is bound to the kernel that was compiled or loaded first (numba 0.68).
 
-    Machine code from the cache then gave other bits than machine code just compiled.
+    Cached machine code then gave other bits than newly compiled machine code.
     """
     names = [module.name for module in pkgutil.iter_modules(kernels.__path__, PREFIX)]
     modules = [vars(importlib.import_module(name)) for name in names if not name.endswith("_triton")]
@@ -159,7 +159,7 @@ def test_lookups_from_several_threads_at_once():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork.*:DeprecationWarning")
 def test_lookups_after_a_fork():
-    """As PyTorch's own data loaders do: the child uses one thread for PyTorch's operators, which hang otherwise."""
+    """The child uses one thread for PyTorch's operators, as PyTorch's data loaders do; otherwise they hang."""
     expected = lookups(9000)
     child = os.fork()
     if child == 0:

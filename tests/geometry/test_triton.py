@@ -1,4 +1,4 @@
-"""Source of truth: the plain backend, on a GPU, or anywhere with TRITON_INTERPRET=1 and Triton installed."""
+"""Source of truth: the plain backend. The tests need Triton, and a GPU or TRITON_INTERPRET=1."""
 
 import os
 

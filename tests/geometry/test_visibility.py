@@ -1,4 +1,4 @@
-"""Source of truth: a ball, whose depth is known in closed form, and loops over points, views and steps."""
+"""Source of truth: the depth of a ball in closed form, and loops over points, views and steps."""
 
 import math
 from dataclasses import replace
@@ -25,14 +25,14 @@ SIZE = (20, 24)
 
 
 def ball(radius=0.5, side=64):
-    """A grid of the voxels whose centres lie in a ball about the origin."""
+    """A grid whose occupied voxels have their centres in a ball around the origin."""
     whole = full(Sphere(), side)
     inside = whole.centres().norm(dim=1) < radius
     return Occupancy(inside.reshape(side, side, side), Sphere())
 
 
 def planes(cameras=None):
-    """Views of a ball; where no cameras are given, the lower border of the last one cuts it."""
+    """Views of a ball. With the default cameras, the lower border of the last view cuts the ball."""
     cutting = camera_at((1.5, 0.5, 2.5), SIZE, target=(0.0, 0.8, 0.0))
     views = ball_views(cameras or concatenate([ring(4, SIZE), cutting]))
     return VisibilityPlanes(views.images, views.cameras, views.masks, carve(views.masks, views.cameras, Sphere(), 32))
@@ -44,15 +44,15 @@ def queries(count, seed=0):
     return points, torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
 
 
-def test_the_depth_of_a_ball_is_that_of_its_sphere():
+def test_the_depth_of_a_ball_is_that_in_closed_form():
     cameras = ring(3, SIZE)
     found = first_hits(ball(), cameras)
     pixels = pixel_grid(*SIZE)
     for view in range(3):
         rays = cast(cameras, torch.full((len(pixels),), view), pixels, Sphere(radius=0.5))
-        hit = (rays.far - rays.near) > 0.2  # not where a ray only grazes it
+        hit = (rays.far - rays.near) > 0.2  # no rays that are almost tangent
         error = found[view].flatten()[hit] - rays.near[hit]
-        assert error.abs().max() < 2 / 64 + 1 / 128  # a voxel, and half a step
+        assert error.abs().max() < 2 / 64 + 1 / 128  # a voxel plus half a step
 
 
 def test_rays_without_a_voxel_end_at_the_far_side_of_the_sphere_and_masked_ones_are_not_followed():
@@ -65,7 +65,7 @@ def test_rays_without_a_voxel_end_at_the_far_side_of_the_sphere_and_masked_ones_
 
 
 def skewed(cameras):
-    """Cameras whose pixels are no rectangles."""
+    """Cameras with skew."""
     cameras.intrinsics[:, 0, 1], cameras.intrinsics[:, 1, 1] = 3.0, cameras.intrinsics[:, 1, 1] * 1.4
     return cameras
 
@@ -74,7 +74,7 @@ def skewed(cameras):
     "cameras",
     [
         ring(4, SIZE),
-        concatenate([camera_at((0.1, 0.7, 0.2), SIZE), camera_at((0.0, 0.0, 9.0), SIZE)]),  # one within the scene
+        concatenate([camera_at((0.1, 0.7, 0.2), SIZE), camera_at((0.0, 0.0, 9.0), SIZE)]),  # one is inside the scene
         skewed(ring(3, SIZE)),
         distorted(ring(3, SIZE), torch.tensor([[-0.4, 0.1, 0.01, -0.02, 0.0]])),
     ],
@@ -87,11 +87,11 @@ def test_kernel_and_plain_pytorch_find_the_same_depth(monkeypatch, cameras):
     monkeypatch.setattr(first_hits_module, "find_spec", lambda name: None)
     plain = first_hits(grid, cameras, masks)
     assert plain.unique().numel() > 20
-    assert (compiled - plain).abs().gt(1e-5).float().mean() < 2e-3  # samples on the side of a voxel may fall either way
+    assert (compiled - plain).abs().gt(1e-5).float().mean() < 2e-3  # samples may round to either voxel
 
 
 def slow_penalties(shown, points, hidden=()):
-    """Direction, depth, coverage and penalty of every view at every point, one after the other."""
+    """Direction, depth, coverage and penalty of every view at every point, in loops."""
     matrices, eyes = projection_matrices(shown.colours.cameras), centres(shown.colours.cameras)
     height, width = SIZE
     rows = []
@@ -133,20 +133,20 @@ def test_the_chosen_views_are_those_of_the_definition(monkeypatch, compiled):
         torch.testing.assert_close(
             values, every.gather(1, chosen.views[..., None].expand(-1, -1, 6)), atol=2e-5, rtol=0
         )
-        assert all(len(set(row)) == 3 for row in chosen.views.tolist())  # of two and the next one, or of three
+        assert all(len(set(row)) == 3 for row in chosen.views.tolist())  # three different views
         least = order.sort(1).values[:, :3]
         torch.testing.assert_close(order.gather(1, chosen.views), least, atol=1e-4, rtol=0)
     unseen = every[..., 5] == UNSEEN
     assert unseen[:, 2].all()
-    assert 0.2 < unseen.float().mean() < 0.8  # of both kinds
+    assert 0.2 < unseen.float().mean() < 0.8  # some are seen, some are not
     torch.testing.assert_close(found.coverage, every[..., 4].amin(1), atol=1e-5, rtol=0)
     assert torch.equal(found.number, (~unseen).sum(1).float())
     assert torch.equal(found.best.valid, ~unseen.gather(1, found.best.views))
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_what_hides_a_point_costs_alike_where_penalties_are_alike(monkeypatch, compiled):
-    """Points of the surface that each view sees, which the others see, see from behind, or see at an edge."""
+def test_where_penalties_are_equal_occlusion_decides_alike(monkeypatch, compiled):
+    """Points of the surface that each view sees, and that other views see, see from behind or see at an edge."""
     handicaps = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4])
     shown = planes(ring(5, SIZE)).with_handicaps(handicaps)
     if not compiled:
@@ -156,7 +156,7 @@ def test_what_hides_a_point_costs_alike_where_penalties_are_alike(monkeypatch, c
     points = cast(shown.colours.cameras, view, pixels, Sphere()).at(shown.depth_opacity[view, row, column, :1])[:, 0]
     seen = shown.with_penalties(Penalties.alike()).choose(points, best=len(shown)).best
     hidden, valid = (seen.behind > shown.tolerance) | (seen.coverage < WHOLE), seen.penalty < UNSEEN
-    assert 0.1 < hidden[valid].float().mean() < 0.9  # of both kinds
+    assert 0.1 < hidden[valid].float().mean() < 0.9  # some are hidden, some are not
     expected = hidden.float() + handicaps[seen.views]
     clear = (seen.behind - shown.tolerance).abs() > 1e-5
     torch.testing.assert_close(seen.penalty[valid & clear], expected[valid & clear])
@@ -176,14 +176,14 @@ def test_blended_colours_are_those_of_the_unstructured_lumigraph(monkeypatch, co
     torch.testing.assert_close(blend_views(shown, points, directions, 2), expected, atol=2e-3, rtol=0)
 
 
-def test_a_border_cuts_an_object_where_some_pixels_along_it_are_whole():
-    """Two of them at least, and a fiftieth of the shorter side: four of 200 x 400."""
+def test_a_border_cuts_an_object_if_enough_of_its_pixels_are_set():
+    """At least two pixels and a fiftieth of the shorter side are needed: four pixels of a picture of 200 x 400."""
     masks = torch.zeros(7, 1, 40, 60)
     masks[1, 0, 5:35, 10:50] = 1  # nothing is cut
-    masks[2, 0, 0, 0] = 1  # one pixel of two sides
-    masks[3, 0, 10:12, 0] = 1  # two on the left
-    masks[4, 0, :, -1] = 0.97  # all of the right, where there may be anything
-    masks[5, 0, 20:, 30:] = 1  # right and lower
+    masks[2, 0, 0, 0] = 1  # one pixel at two borders
+    masks[3, 0, 10:12, 0] = 1  # two pixels at the left border
+    masks[4, 0, :, -1] = 0.97  # all of the right border, with partial coverage
+    masks[5, 0, 20:, 30:] = 1  # at the right and the lower border
     masks[6] = 1
     cut = torch.tensor(
         [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 1], [1, 1, 1, 1]]
@@ -194,18 +194,18 @@ def test_a_border_cuts_an_object_where_some_pixels_along_it_are_whole():
     torch.testing.assert_close(margins(large), MARGIN * 200 * torch.tensor([[0, 0, 0, 0], [0, 0, 1, 0]]))
 
 
-def test_a_picture_fades_out_over_the_margins_of_the_borders_that_cut_the_object():
-    """By hand, of 41 x 61 pixels: at the left border, halfway, beyond the margin, at the lower and the right border."""
+def test_penalties_grow_over_the_margins_of_borders_that_cut_the_object():
+    """By hand, for 41 x 61 pixels: at the left border, halfway, beyond the margin, at the lower and right borders."""
     margin = MARGIN * 41
     pixels = torch.tensor([[0.0, 20.0], [margin / 2, 20.0], [margin + 1, 20.0], [30.0, 40.0], [60.0, 20.0]])
     coordinates = (pixels / torch.tensor([60.0, 40.0]) * 2 - 1)[:, None].expand(-1, 2, 2)
     found = fading(torch.tensor([[margin, 0, 0, margin], [0, 0, 0, 0]]), coordinates, (41, 61))
     torch.testing.assert_close(found, torch.tensor([[1.0, 0], [0.5, 0], [0, 0], [1, 0], [0, 0]]), atol=1e-5, rtol=0)
-    beyond = torch.full((1, 1, 2), 1 + 1e-6)  # as lookups round
+    beyond = torch.full((1, 1, 2), 1 + 1e-6)  # as lookups do by rounding
     assert float(fading(torch.zeros(1, 4), beyond, (41, 61))) == 0
 
 
-def test_a_picture_fades_out_by_where_its_lens_shows_a_point():
+def test_the_margin_is_measured_where_the_lens_shows_a_point():
     pinholes = concatenate([ring(4, SIZE), camera_at((1.5, 0.5, 2.5), SIZE, target=(0.0, 0.8, 0.0))])
     cameras = distorted(pinholes, torch.tensor([0.4, 0.0, 0.0, 0.0, 0.0]))
     views, (points, _) = ball_views(cameras), queries(500)
@@ -213,7 +213,7 @@ def test_a_picture_fades_out_by_where_its_lens_shows_a_point():
     fading_out, whole = VisibilityPlanes(*given), VisibilityPlanes(*given)
     whole._against = replace(whole._against, margins=torch.zeros_like(whole._against.margins))
     found, plain = (_penalties_of(each.choose(points, best=5).best, 4) for each in (fading_out, whole))
-    # by hand: the row where the lens shows the point, and how far it lies in the margin of the lower border
+    # by hand: the row in which the lens shows the point, and its position in the margin of the lower border
     matrix = projection_matrices(pinholes)[4]
     ideal = points @ matrix[:, :3].T + matrix[:, 3]
     ideal = (ideal[:, :2] / ideal[:, 2:])[:, None].expand(-1, 5, -1)
@@ -226,11 +226,11 @@ def test_a_picture_fades_out_by_where_its_lens_shows_a_point():
 
 
 def _penalties_of(chosen, view):
-    """The penalties of one of the views, all of which were chosen."""
+    """The penalties of one view, where all views were chosen."""
     return chosen.penalty[chosen.views == view]
 
 
-def test_a_point_on_a_ball_is_seen_from_its_side_and_lies_behind_it_from_the_other():
+def test_a_point_on_a_ball_is_visible_from_its_side_and_hidden_from_the_opposite_side():
     views = ball_views(ring(12, (64, 64)))
     shown = VisibilityPlanes(views.images, views.cameras, views.masks, ball())
     normal = torch.nn.functional.normalize(centres(views.cameras)[4] + 0.1, dim=0)
@@ -241,11 +241,11 @@ def test_a_point_on_a_ball_is_seen_from_its_side_and_lies_behind_it_from_the_oth
             assert abs(behind) < 0.1
         if cosine < -0.5:
             assert behind == pytest.approx(2 * 0.48 * -cosine, abs=0.15)
-    assert facing[0] > 0.3  # the best view stands on the point's side
+    assert facing[0] > 0.3  # the best view is on the point's side
     assert found.penalty[0].tolist() == sorted(found.penalty[0].tolist())
 
 
-def test_depths_of_the_hull_are_computed_once_for_all_copies_and_not_where_opacities_are_enough(monkeypatch):
+def test_depths_of_the_hull_are_computed_once_and_only_if_opacities_do_not_suffice(monkeypatch):
     computed = []
 
     def counted(*given):
@@ -258,24 +258,24 @@ def test_depths_of_the_hull_are_computed_once_for_all_copies_and_not_where_opaci
     coverage = shown.choose(points, best=0).coverage
     by_surface = shown.with_surface(ball(side=32))
     by_surface.choose(points, directions, best=0, nearest=2)
-    assert len(computed) == 1  # of the surface
+    assert len(computed) == 1  # that of the surface
     copies = [shown.with_penalties(Penalties.alike()), shown.with_handicaps(torch.zeros(len(shown))), by_surface]
     for each in (shown, *copies):
         torch.testing.assert_close(each.choose(points, best=2).coverage, coverage)
     assert len(computed) == 2
 
 
-def test_without_masks_every_picture_counts_as_opaque():
+def test_without_masks_all_pixels_count_as_opaque():
     views = ball_views(ring(3, SIZE), masks=False)
     shown = VisibilityPlanes(views.images, views.cameras, None, full(Sphere(), 4))
     found = shown.choose(torch.zeros(1, 3), best=3)
     assert torch.equal(found.coverage, torch.ones(1))
-    assert math.isclose(float(found.best.behind[0, 0]), 1.0, abs_tol=0.02)  # the centre lies a radius inside the sphere
+    assert math.isclose(float(found.best.behind[0, 0]), 1.0, abs_tol=0.02)  # the centre's depth
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_the_nearest_views_are_judged_by_the_surface_that_is_given_and_the_best_by_the_hull(monkeypatch, compiled):
-    """A hull that fills the scene, and the ball in it: told the ball's surface, planes choose as those of the ball."""
+def test_the_nearest_views_depend_on_the_given_surface_and_the_best_on_the_hull(monkeypatch, compiled):
+    """With the ball's surface, planes whose hull fills the scene choose the views that the ball's planes choose."""
     views, (points, directions) = ball_views(ring(5, SIZE)), queries(60)
     if not compiled:
         monkeypatch.setattr(module, "find_spec", lambda name: None)
@@ -302,14 +302,14 @@ def test_the_nearest_views_are_judged_by_the_surface_that_is_given_and_the_best_
 
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_points_that_are_not_finite_are_seen_by_no_view_and_leave_the_others_as_they_are(monkeypatch, compiled, value):
+def test_points_that_are_not_finite_are_seen_by_no_view_and_do_not_change_others(monkeypatch, compiled, value):
     if not compiled:
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     shown, (points, directions) = planes(), queries(600)
     expected = shown.choose(points, directions, best=3, nearest=2)
     spoiled, other = points.clone(), torch.arange(600) % 5 > 0
     spoiled[~other, 1] = value
-    torch.full((600, 20), 2**40).sum()  # memory that is written to and left: what nothing fills holds no index
+    torch.full((600, 20), 2**40).sum()  # so that uninitialised memory holds invalid indices
     for given in ((spoiled, directions), (points, directions + spoiled - points)):
         found = shown.choose(*given, best=3, nearest=2)
         for part, clean in ((found.best, expected.best), (found.nearest, expected.nearest)):
@@ -320,7 +320,7 @@ def test_points_that_are_not_finite_are_seen_by_no_view_and_leave_the_others_as_
     assert not shown.choose(spoiled, directions, best=3).number[~other].any()
 
 
-def test_rays_from_so_far_away_that_a_step_is_lost_in_rounding_end():
+def test_rays_end_whose_step_is_lost_to_rounding():
     far = camera_at((0.0, 0.0, 1e6), SIZE)
     far.intrinsics[:, :2, :2] *= 1e6 / 3
     depths = []
@@ -331,7 +331,7 @@ def test_rays_from_so_far_away_that_a_step_is_lost_in_rounding_end():
     assert depths[0].min() >= 1e6 - 1
 
 
-def test_planes_made_in_inference_mode_are_used_outside_of_it():
+def test_planes_made_in_inference_mode_can_be_used_outside_it():
     points, directions = queries(50)
     with torch.inference_mode():
         made = planes()
@@ -369,8 +369,8 @@ def test_a_hull_is_carved_and_its_depth_found_under_transforms():
     assert int(count) == int(carve(views.masks, views.cameras, Sphere(), 16).occupied.sum())
 
 
-def test_cameras_that_move_in_place_see_from_where_they_stand():
-    """The kernels and plain PyTorch, which reads them at each call, choose the same views."""
+def test_cameras_that_are_changed_in_place_have_their_new_poses():
+    """The kernels choose the views that plain PyTorch chooses, which reads the cameras at each call."""
     shown, (points, directions) = planes(ring(4, SIZE)), queries(200)
     before = shown.choose(points, directions, best=2, nearest=2).best.views
     poses = shown.colours.cameras.extrinsics

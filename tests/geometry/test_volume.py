@@ -1,4 +1,4 @@
-"""Source of truth: a ball of one colour, whose volume, hull and pictures are known, and linear functions."""
+"""Source of truth: a ball of one colour, with known volume, hull and pictures, and linear functions."""
 
 import math
 
@@ -16,13 +16,13 @@ def planes_of(views, side=64):
     return VisibilityPlanes(views.images, views.cameras, views.masks, hull)
 
 
-def test_the_shares_of_the_cells_are_those_of_the_hull():
+def test_the_occupied_shares_of_cells_are_those_of_the_hull():
     planes = planes_of(ball_views(ring(20, (48, 48))))
     share = volume_of(planes)[0]
     assert share.shape == (SIDE, SIDE, SIDE)
     assert float(share.sum()) * 8 == pytest.approx(int(planes.occupancy.occupied.sum()))
     ball = 4 / 3 * math.pi * 0.5**3
-    assert ball < float(share.sum()) * (2 / SIDE) ** 3 < 1.4 * ball  # the hull holds the ball
+    assert ball < float(share.sum()) * (2 / SIDE) ** 3 < 1.4 * ball  # the hull contains the ball
 
 
 def test_cells_at_the_surface_have_the_colour_of_the_ball_and_those_outside_are_zero():
@@ -37,7 +37,7 @@ def test_cells_at_the_surface_have_the_colour_of_the_ball_and_those_outside_are_
     assert not volume[:, share == 0].any()
 
 
-def test_the_number_of_views_that_show_a_cell_is_that_of_all():
+def test_cells_that_all_views_show_count_all_views():
     volume = volume_of(planes_of(ball_views(ring(7, (48, 48)))))
     assert len(volume) == CHANNELS
     assert volume[4].max() == pytest.approx(math.log(7))
@@ -57,7 +57,7 @@ def test_the_order_of_the_views_does_not_matter():
     torch.testing.assert_close(volume_of(planes_of(views[order])), volume_of(planes_of(views)), atol=1e-5, rtol=1e-4)
 
 
-def test_a_linear_function_is_interpolated_exactly_and_held_beyond_the_outermost_centres():
+def test_a_linear_function_is_interpolated_exactly_and_constant_beyond_the_outermost_centres():
     bounds, weights = Sphere((0.5, -1.0, 2.0), 3.0), torch.tensor([0.3, -0.7, 0.2])
     unit = (torch.arange(SIDE) + 0.5) * (2 / SIDE) - 1
     x, y, z = torch.meshgrid(unit, unit, unit, indexing="ij")

@@ -1,4 +1,4 @@
-"""Source of truth: the same field with the code written beside every point that its layers read."""
+"""Source of truth: the same field with the code concatenated to the inputs of its layers."""
 
 import pytest
 import torch
@@ -38,22 +38,22 @@ def test_the_code_is_an_input_of_every_layer_that_reads_a_point(target):
     torch.testing.assert_close(model.adapt_to(prepared).field.hidden(points), hidden, rtol=1e-4, atol=1e-5)
 
 
-def test_nothing_but_biases_of_reading_layers_is_shifted():
+def test_only_biases_of_layers_that_read_a_point_are_updated():
     model = make(coarse_network=True)
     shifts = model.update(model.prepare(ball_views(ring(4))))
     assert set(shifts) == {f"{part}.layers.{layer}.bias" for part in ("fine", "coarse") for layer in (0, 1)}
 
 
-def test_it_learns_what_tells_objects_apart(tmp_path):
+def test_it_learns_to_distinguish_objects(tmp_path):
     model = make(target="nerf")
-    rates = {"learning_rate": 5e-3, "hypernetwork_learning_rate": 5e-3}  # at 1e-2, some seeds end in one constant field
+    rates = {"learning_rate": 5e-3, "hypernetwork_learning_rate": 5e-3}  # at 1e-2, some seeds give a constant field
     config = TrainingConfig(steps=25, tasks=3, rays=64, evaluate_every=100, **rates)
     trainer = Trainer(model, Balls(), config, tmp_path)
     losses = [trainer.take_step() for _ in range(25)]
     assert sum(losses[-5:]) < 0.6 * sum(losses[:5])
     data = Balls()
     one, other = (model.adapt(data.task(name).support).render(ring(1)).images for name in ("train0", "train2"))
-    assert (one - other)[..., 5:11, 5:11].mean().abs() > 0.03  # within both balls, whose outlines the hulls tell apart
+    assert (one - other)[..., 5:11, 5:11].mean().abs() > 0.03  # inside both balls; outside, the hulls differ
     trainer.save()
     assert HyperPlanes.from_pretrained(tmp_path).config.method == "autoencoder"
 

@@ -1,5 +1,5 @@
-"""Sources of truth: the formulas of the updates, and properties (an untrained one changes nothing, a batch is its
-objects one by one, centred updates have mean zero, a mean of codes knows no order).
+"""Sources of truth: the formulas of the updates, and properties (an untrained hypernetwork changes nothing, objects of
+a batch are independent, centred updates have mean zero, a mean of codes does not depend on the order of views).
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ SHAPES = {
 
 
 class _OneByOne(ImageHyperNetwork):
-    """Called with the images and directions of several objects, or of one, whose update alone it returns."""
+    """A hypernetwork that is called with images and directions of several objects, or of one object."""
 
     def __call__(self, images, directions, theta):
         if images.ndim == 5:
@@ -41,7 +41,7 @@ class _OneByOne(ImageHyperNetwork):
 def make(config=CONFIG, *, awake=True):
     torch.manual_seed(0)
     network = _OneByOne(config, SHAPES)
-    if awake:  # the outputs start at zero; here they are to say something
+    if awake:  # the output layers are initialised with zero
         for output in network.outputs:
             torch.nn.init.normal_(output.weight)
     return network.eval()
@@ -74,7 +74,7 @@ def test_the_update_has_the_names_and_shapes_of_the_chosen_layers():
 
 
 @torch.no_grad()
-def test_every_input_is_seen():
+def test_the_update_depends_on_every_input():
     network, (images, directions, theta) = make(), inputs()
     update = network(images, directions, theta)
     for view in range(3):
@@ -90,7 +90,7 @@ def test_every_input_is_seen():
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @torch.no_grad()
-def test_viewing_directions_are_seen_on_both_sides_of_zero(view, axis, sign):
+def test_the_update_depends_on_positive_and_negative_viewing_directions(view, axis, sign):
     network, (images, directions, theta) = make(), inputs()
     directions[view, axis] = 0.3 * sign
     changed = directions.clone()
@@ -99,7 +99,7 @@ def test_viewing_directions_are_seen_on_both_sides_of_zero(view, axis, sign):
 
 
 @torch.no_grad()
-def test_directions_and_weights_can_be_left_out():
+def test_directions_and_weights_can_be_omitted():
     images, directions, theta = inputs()
     other = {name: value + 1 for name, value in theta.items()}
     blind = make(replace(CONFIG, see_directions=False))
@@ -111,8 +111,8 @@ def test_directions_and_weights_can_be_left_out():
 
 @torch.no_grad()
 @pytest.mark.parametrize("join", ["concatenate", "mean"])
-def test_an_input_that_is_left_out_is_zero_and_nothing_else_changes(join):
-    # the same weights, and the update of a network that sees everything where the input it does not see is zero
+def test_omitting_an_input_is_the_same_as_zeros(join):
+    # it has the same weights and the same update as a network with all inputs whose omitted input is zero
     (images, directions, theta), config = inputs(), replace(CONFIG, join=join)
     whole = make(config)
     nothing = {name: torch.zeros_like(value) for name, value in theta.items()}
@@ -129,7 +129,7 @@ def test_an_input_that_is_left_out_is_zero_and_nothing_else_changes(join):
 def test_the_head_has_the_depth_and_width_of_its_configuration(depth):
     head = make(replace(CONFIG, depth=depth, width=20)).head
     assert [layer.out_features for layer in head] == [20] * depth
-    # three images of code 8 with a direction each, and the code of theta
+    # three images with a code of 8 and a direction each, and the code of theta
     assert head[0].in_features == 3 * (8 + 3) + 8
 
 
@@ -144,7 +144,7 @@ def test_gradients_reach_the_hypernetwork_the_images_and_theta():
     assert all((theta[name].grad is not None) == (name in update) for name in theta)
 
 
-def test_objects_in_one_batch_are_those_one_by_one():
+def test_objects_of_a_batch_are_independent():
     network = make()
     several = [inputs(seed) for seed in range(3)]
     theta = several[0][2]
@@ -157,7 +157,7 @@ def test_objects_in_one_batch_are_those_one_by_one():
 @pytest.mark.parametrize("update", ["full", "low_rank"])
 @torch.no_grad()
 def test_updates_against_their_formulas(update):
-    # Closed form: the outputs o themselves (full), or of a row o W plus U V (low rank).
+    # Closed form: the outputs themselves (full), or for each row a multiple of the row of W, plus U V (low rank).
     network = make(replace(CONFIG, update=update, layers=("all",), rank=2))
     images, directions, theta = inputs()
     caught = []
@@ -184,27 +184,27 @@ def test_every_option_changes_the_update(change):
     updates = []
     for config in (CONFIG, replace(CONFIG, **change)):
         network = make(config).train()
-        network(*shown, inputs()[2])  # fresh statistics, mean 0 and variance 1, standardise nothing
+        network(*shown, inputs()[2])  # initial statistics (mean 0, variance 1) would standardise nothing
         updates.append(network.eval()(*inputs()))
     assert differs(*updates)
 
 
 @torch.no_grad()
-def test_directions_are_no_input_of_a_mean_that_is_told_so():
+def test_directions_can_be_omitted_from_a_mean():
     images, directions, theta = inputs()
     blind = make(replace(CONFIG, join="mean", see_directions=False))
     assert not differs(blind(images, directions, theta), blind(images, directions.flip(0), theta))
 
 
 @torch.no_grad()
-def test_the_mean_of_codes_knows_no_order_of_the_views():
+def test_the_mean_of_codes_does_not_depend_on_the_order_of_views():
     network = make(replace(CONFIG, join="mean"))
     images, directions, theta = inputs()
     order = [2, 0, 1]
     shuffled = network(images[order], directions[order], theta)
     for name, value in network(images, directions, theta).items():
         torch.testing.assert_close(value, shuffled[name])
-    assert differs(shuffled, network(images[order], directions, theta))  # but which image has which direction
+    assert differs(shuffled, network(images[order], directions, theta))  # directions belong to images
 
 
 @torch.no_grad()
@@ -213,7 +213,7 @@ def test_a_centred_update_has_mean_zero_over_the_objects_it_was_trained_on():
     objects = [inputs(seed)[:2] for seed in range(4)]
     images, directions = (torch.stack(parts) for parts in zip(*objects, strict=True))
     theta = inputs()[2]
-    for _ in range(200):  # the running statistics come to those of these objects
+    for _ in range(200):  # the running statistics converge to those of these objects
         updates = network(images, directions, theta)
     mean = {name: torch.stack([each[name] for each in updates]).mean(0) for name in updates[0]}
     size = max(float(each[name].abs().max()) for each in updates for name in each)
@@ -262,8 +262,8 @@ def test_all_of_theta_or_the_updated_layers_are_read():
     ],
     ids=["low rank", "autoencoder"],
 )
-def test_where_only_shapes_are_asked_for_no_number_is_drawn(make, monkeypatch):
-    # Source of truth: the same with its numbers. To draw any on "meta", PyTorch loads its compiler, in a second.
+def test_no_random_numbers_are_drawn_on_the_meta_device(make, monkeypatch):
+    # Source of truth: the shapes on the CPU. Drawing on "meta" makes PyTorch load its compiler, in a second.
     expected = {name: value.shape for name, value in make().state_dict().items()}
     monkeypatch.setattr(torch.Tensor, "normal_", None)
     monkeypatch.setattr(torch, "randn", None)
@@ -273,8 +273,8 @@ def test_where_only_shapes_are_asked_for_no_number_is_drawn(make, monkeypatch):
 
 
 @torch.no_grad()
-def test_what_is_read_of_a_matrix_and_a_bias():
-    # Closed form: the code of W and b is A (U W V, u b) + c, by hand from the reader's own numbers.
+def test_the_code_of_a_matrix_and_a_bias():
+    # Closed form: the code of W and b is A (U W V, u b) + c, with the parameters of the reader.
     reader = LowRankReader({"w": torch.Size([6, 5]), "b": torch.Size([6])}, 3)
     theta = {"w": torch.randn(6, 5), "b": torch.randn(6)}
     products = torch.einsum("ri,ij,jc->rc", reader.left[0], theta["w"], reader.right[0]).flatten()
@@ -283,7 +283,7 @@ def test_what_is_read_of_a_matrix_and_a_bias():
     torch.testing.assert_close(reader(theta), expected)
 
 
-def test_reading_the_papers_network_takes_few_numbers():
+def test_reading_the_network_of_the_paper_takes_few_parameters():
     with torch.device("meta"):
         target = PointMultiPlaneNeRF(TargetConfig())
         reader = LowRankReader({name: value.shape for name, value in target.named_parameters()}, 128)

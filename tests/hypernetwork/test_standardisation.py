@@ -1,4 +1,4 @@
-"""Sources of truth: mean and variance of what was shown, and the gradient of torch's batch normalisation."""
+"""Sources of truth: mean and variance of the inputs, and the gradient of PyTorch's batch normalisation."""
 
 import pytest
 import torch
@@ -6,8 +6,8 @@ import torch
 from hyperplanes.hypernetwork.standardisation import EPSILON, RunningStandardisation
 
 
-def test_the_statistics_become_those_of_what_it_is_shown():
-    # Statistics: codes of known mean and variance, 4 objects a step.
+def test_the_statistics_converge_to_those_of_the_inputs():
+    # Statistics: codes with known mean and variance, 4 objects per step.
     generator = torch.Generator().manual_seed(0)
     mean, deviation = torch.tensor([5.0, -3.0]), torch.tensor([0.1, 4.0])
     layer = RunningStandardisation((2,), momentum=0.01)
@@ -29,20 +29,20 @@ def test_the_first_steps_are_averaged_evenly():
 
 
 def test_the_variance_of_single_objects_is_that_of_the_objects():
-    """Not that of the start, which is 10,000 times as large."""
+    """Not the initial variance, which is 10,000 times as large."""
     generator, layer = torch.Generator().manual_seed(0), RunningStandardisation((2,))
     for _ in range(40):
         layer(0.01 * torch.randn(1, 2, generator=generator))
     assert (layer.variance.sqrt() / 0.01).sub(1).abs().max() < 0.5
 
 
-def test_one_object_a_step_is_enough():
+def test_one_object_per_step_gives_finite_values():
     layer = RunningStandardisation((3,))
     assert layer(torch.ones(1, 3)).isfinite().all()
     assert layer(2 * torch.ones(1, 3)).isfinite().all()
 
 
-def test_evaluation_changes_nothing():
+def test_evaluation_does_not_change_the_statistics():
     layer = RunningStandardisation((3,))
     layer(torch.randn(4, 3))
     layer.eval()
@@ -51,17 +51,17 @@ def test_evaluation_changes_nothing():
     assert all(torch.equal(value, layer.state_dict()[name]) for name, value in before.items())
 
 
-def test_training_computes_what_evaluation_does():
+def test_training_and_evaluation_give_the_same_values():
     layer = RunningStandardisation((3,))
     for _ in range(5):
         layer(torch.randn(4, 3) + 2)
     codes = torch.randn(4, 3)
-    training = layer(codes)  # by the statistics that this step is part of
+    training = layer(codes)  # with statistics that include this step
     torch.testing.assert_close(training, layer.eval()(codes))
 
 
 def test_the_gradient_is_that_of_batch_normalisation_scaled_to_the_running_deviation():
-    # Another implementation: torch's batch norm, whose gradient knows nothing of what all objects have in common.
+    # Another implementation: PyTorch's batch norm, whose gradient has no component that all objects share.
     layer = RunningStandardisation((2,))
     for _ in range(5):
         layer(3 * torch.randn(4, 2))

@@ -1,4 +1,4 @@
-"""Hypernetworks that read a grid. Source of truth: what must not matter, and what must be zero."""
+"""Hypernetworks that read a grid. Sources of truth: PyTorch's convolutions, and properties."""
 
 import pytest
 import torch
@@ -32,7 +32,7 @@ def test_an_untrained_hypernetwork_changes_nothing_and_names_the_grids_by_their_
         assert not any(value.any() for value in update.values())
 
 
-def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch():
+def test_updates_of_objects_of_a_batch_are_independent():
     torch.manual_seed(2)
     network = VolumeHyperNetwork(SHAPES, CHANNELS, SIDE).eval()
     torch.nn.init.normal_(network.encoder.last.weight, std=0.1)
@@ -45,7 +45,7 @@ def test_the_update_of_an_object_does_not_depend_on_what_else_is_in_the_batch():
         assert not torch.allclose(together[0][name], together[1][name])
 
 
-def test_a_cell_has_features_of_what_lies_around_it():
+def test_features_of_a_cell_depend_on_its_neighbourhood():
     network = VolumeNetwork(CHANNELS, SIDE, 4).eval()
     torch.nn.init.normal_(network.last.weight, std=0.1)
     first = volumes(1)
@@ -62,7 +62,7 @@ def test_a_side_that_cannot_be_halved_three_times_is_refused():
         VolumeNetwork(CHANNELS, 12, 4)
 
 
-@pytest.mark.parametrize("count", [1, 2])  # a single volume goes another way
+@pytest.mark.parametrize("count", [1, 2])  # a single volume has its own implementation
 @pytest.mark.parametrize(("layer", "plain"), [(_Convolution(3, 5, 2), (2, 1)), (_Pointwise(3, 5), (1, 0))])
 def test_convolutions_and_their_gradients_are_those_of_pytorch(layer, plain, count):
     stride, padding = plain
@@ -73,8 +73,8 @@ def test_convolutions_and_their_gradients_are_those_of_pytorch(layer, plain, cou
     torch.testing.assert_close(*(torch.autograd.grad((2 * each).sin().sum(), variables) for each in (found, expected)))
 
 
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # by jvp
-@pytest.mark.filterwarnings("ignore:TF32 acceleration on top of oneDNN:UserWarning")  # by flags
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # in jvp
+@pytest.mark.filterwarnings("ignore:TF32 acceleration on top of oneDNN:UserWarning")  # in flags
 def test_a_single_volume_is_convolved_under_transforms_in_double_precision_and_without_onednn():
     layer = _Convolution(3, 5)
     given = torch.randn(1, 3, 6, 6, 6, generator=torch.Generator().manual_seed(3))
@@ -88,7 +88,7 @@ def test_a_single_volume_is_convolved_under_transforms_in_double_precision_and_w
         torch.testing.assert_close(layer(given), expected)
 
 
-def test_a_pointwise_convolution_reads_several_inputs_as_if_they_were_one():
+def test_a_pointwise_convolution_reads_several_inputs_as_if_they_were_concatenated():
     layer, parts = (
         _Pointwise(5, 4),
         torch.randn(2, 5, 2, 2, 2, generator=torch.Generator().manual_seed(4)).split([2, 3], 1),

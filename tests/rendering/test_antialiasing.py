@@ -1,4 +1,4 @@
-"""Sources of truth: many rays a pixel, which show the mean over its area, and the rays that a picture is made of."""
+"""Sources of truth: the mean over many rays per pixel, and the rays of a picture, rendered separately."""
 
 from functools import cache
 
@@ -21,8 +21,8 @@ def ball(points, directions):
     return colour, 400.0 * (points.norm(dim=1) < 0.5)
 
 
-def mist(points, directions):
-    """A field whose pixels hardly differ from their neighbours."""
+def haze(points, directions):
+    """A field whose pictures have nearly no differences between neighbouring pixels."""
     return torch.full_like(points, 0.5), points[:, 0].square()
 
 
@@ -32,7 +32,7 @@ def picture(field, antialias, sampling=MARCH, cameras=CAMERAS):
 
 @cache
 def truth():
-    """The mean over the area of each pixel of the ball, by six rays along a side."""
+    """The mean of 6 x 6 rays over the area of each pixel of the ball."""
     height, width = camera.image_size(CAMERAS)
     fine = picture(ball, False, cameras=camera.resized(CAMERAS, 6 * height, 6 * width))
     return [torch.nn.functional.avg_pool2d(each, 6) for each in (fine.images, fine.opacity)]
@@ -46,14 +46,14 @@ def test_pixels_at_edges_are_nearer_to_the_mean_over_their_area():
         assert (found - expected).square().mean() < 0.4 * (plain - expected).square().mean()
 
 
-def test_five_rays_are_nearer_than_the_three_of_training(monkeypatch):
+def test_five_rays_are_nearer_to_the_mean_than_the_three_of_training(monkeypatch):
     five = (picture(ball, True).images - truth()[0]).square().mean()
     monkeypatch.setattr(images, "EDGE_SUBPIXELS", SUBPIXELS)
     three = (picture(ball, True).images - truth()[0]).square().mean()
     assert five < 0.6 * three
 
 
-def test_they_are_the_mean_of_five_rays_and_all_others_stay():
+def test_pixels_at_edges_are_the_mean_of_five_rays_and_others_do_not_change():
     found, plain = picture(ball, True), picture(ball, False)
     changed = ((found.images != plain.images).any(1) | (found.opacity != plain.opacity)[:, 0]).nonzero()
     assert 20 < len(changed) < 400
@@ -69,7 +69,7 @@ def test_they_are_the_mean_of_five_rays_and_all_others_stay():
 
 
 @pytest.mark.parametrize("value", range(4))
-def test_pixels_at_edges_are_those_that_differ_from_one_beside_above_or_below(value):
+def test_pixels_at_edges_are_those_that_differ_from_a_neighbour(value):
     # Brute force: a loop over pixels, of one value at a time.
     values = torch.zeros(2, 5, 4, 4)
     values[..., value] = torch.rand(2, 5, 4, generator=torch.Generator().manual_seed(value))
@@ -94,21 +94,21 @@ def test_views_are_rendered_in_groups_to_the_same_pictures(monkeypatch):
     assert together.samples == one_by_one.samples
 
 
-def test_further_rays_are_counted_and_only_where_pixels_differ():
+def test_additional_rays_are_counted_and_used_only_where_pixels_differ():
     assert picture(ball, True).samples > picture(ball, False).samples
-    found, plain = picture(mist, True), picture(mist, False)
+    found, plain = picture(haze, True), picture(haze, False)
     assert found.samples == plain.samples
     assert torch.equal(found.images, plain.images)
 
 
 @pytest.mark.parametrize("sampling", [MARCH, Hierarchical(16, 16)])
-def test_it_is_what_ray_marching_does_and_the_papers_protocol_does_not(sampling):
+def test_antialiasing_is_the_default_only_with_ray_marching(sampling):
     default = picture(ball, None, sampling).images
     assert torch.equal(default, picture(ball, isinstance(sampling, RayMarching), sampling).images)
     assert not torch.equal(picture(ball, True, sampling).images, picture(ball, False, sampling).images)
 
 
-def test_a_picture_with_gradients_has_one_ray_a_pixel():
+def test_a_picture_with_gradients_has_one_ray_per_pixel():
     seen = render(ball, CAMERAS, MARCH, occupancy=GRID, differentiable=True)
     pixels = pixel_grid(24, 24)
     rays = cast(CAMERAS, torch.zeros(len(pixels), dtype=torch.long), pixels)
@@ -121,7 +121,7 @@ def test_a_picture_that_is_one_pixel_has_no_edges():
     assert torch.equal(picture(ball, True, cameras=cameras).images, picture(ball, False, cameras=cameras).images)
 
 
-def test_rays_of_the_same_pixel_are_pooled_as_pictures_are():
+def test_rays_of_the_same_pixel_are_averaged():
     views = ball_views(CAMERAS)
     generator = [torch.Generator().manual_seed(3) for _ in range(2)]
     among = picture(ball, True).opacity.flatten().nonzero()[:, 0]

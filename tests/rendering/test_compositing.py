@@ -76,7 +76,7 @@ def packed_form(keep, *tensors):
 def test_packed_equals_the_loop_for_ragged_and_empty_rays(background):
     colour, density, edges = random_rays(rays=6)
     keep = torch.rand(6, 7, generator=torch.Generator().manual_seed(1)) < 0.6
-    keep[0], keep[3], keep[5] = False, False, False  # first, a middle one and the last see nothing
+    keep[0], keep[3], keep[5] = False, False, False  # the first, the last and a middle ray have no samples
     keep[1], keep[2, 1:] = True, False
     width, middles = edges.diff(dim=1), (edges[:, 1:] + edges[:, :-1]) / 2
     ray, (c, s, w, t) = packed_form(keep, colour, density, width, middles)
@@ -103,7 +103,7 @@ def test_packed_pixels_do_not_depend_on_the_order_of_samples():
     torch.testing.assert_close(one.depth, two.depth)
 
 
-def test_weights_are_shares_of_the_opacity():
+def test_weights_sum_to_the_opacity():
     colour, density, edges = random_rays()
     seen, weights = composite(colour, density * 10, edges)
     assert (weights >= 0).all()
@@ -120,7 +120,7 @@ def test_cutting_an_interval_in_two_changes_no_pixel():
     torch.testing.assert_close(one.opacity, two.opacity)
 
 
-def test_no_samples_at_all_is_background():
+def test_rays_without_samples_have_the_background():
     nothing = torch.zeros(0, dtype=torch.long)
     weights = packed_weights(torch.zeros(0), nothing, 3)
     seen = composite_packed(torch.zeros(0, 3), weights, torch.zeros(0), nothing, 3, 0.75)
@@ -195,8 +195,8 @@ def test_gradients_stay_finite_in_empty_and_in_opaque_space(sigma):
 
 
 @pytest.mark.parametrize("poison", [math.inf, math.nan, 1e30])
-def test_a_broken_density_stays_in_its_own_ray(poison):
-    # Source of truth: the same rays without the broken one between them.
+def test_an_invalid_density_affects_only_its_own_ray(poison):
+    # Source of truth: the same rays without the invalid density.
     thickness = torch.tensor([0.3, 0.2, 0.5, 0.1, 0.7, 0.4])
     ray = torch.tensor([0, 0, 1, 1, 2, 2])
     whole = packed_weights(thickness, ray, 3)
@@ -204,10 +204,10 @@ def test_a_broken_density_stays_in_its_own_ray(poison):
     found = packed_weights(thickness, ray, 3)
     assert torch.equal(found[[0, 1, 2, 4, 5]], whole[[0, 1, 2, 4, 5]])
     if not math.isnan(poison):
-        assert found[3].item() == pytest.approx(math.exp(-0.5))  # all that was left
+        assert found[3].item() == pytest.approx(math.exp(-0.5))  # all remaining transmittance
 
 
-def test_the_depth_is_that_of_the_samples_where_they_are_given():
+def test_the_depth_is_that_of_given_distances():
     # two samples of weights 1/2 and 1/4 at 1.1 and 2.4 in the intervals (1, 2) and (2, 3): (0.55 + 0.6) / 0.75
     density = torch.full((1, 2), math.log(2.0))
     seen, _ = composite(

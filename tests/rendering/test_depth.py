@@ -1,4 +1,4 @@
-"""Sources of truth: a plane and a sphere, whose z, places and normals have closed forms."""
+"""Sources of truth: closed forms of z, positions and normals of a plane and a sphere."""
 
 import math
 
@@ -15,7 +15,7 @@ CAMERAS = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.7), camera.fi
 
 
 def pictured(cameras, distances):
-    """Pictures whose depth along each ray is as given, infinity where there is nothing."""
+    """Pictures with the given depths along rays; infinity means empty."""
     count, pixels = cameras.batch_size, pixel_grid(SIZE, SIZE)
     view = torch.arange(count).repeat_interleave(len(pixels))
     depth = distances(cast(cameras, view, pixels.repeat(count, 1))).reshape(count, 1, SIZE, SIZE)
@@ -45,7 +45,7 @@ def test_a_plane_has_one_normal_whatever_the_lens():
     for cameras in (CAMERAS, distorted(CAMERAS, torch.tensor([0.2, -0.1, 0.0, 0.01, 0.02]))):
         surface = seen_surface(pictured(cameras, plane(normal, 0.2)), cameras)
         seen = surface.covered > 0
-        # away from where the plane is so far or so oblique that its z changes by six pixels a pixel
+        # where the plane is neither too far nor too oblique
         steady = seen & (surface.z < 6) & ((surface.normals @ normal).abs() > 0)
         assert steady.sum() > 1000
         cosine = (surface.normals[steady] @ normal).abs()
@@ -56,8 +56,8 @@ def test_a_plane_has_one_normal_whatever_the_lens():
         )
 
 
-def test_a_sphere_is_where_it_is_with_normals_outwards():
-    """A pixel is 1.5 % of the distance wide, 0.9 degrees of the sphere where it is seen from the front."""
+def test_positions_and_normals_of_a_sphere():
+    """A pixel is 1.5 % of the distance wide, which is 0.9 degrees in the middle of the sphere."""
     surface = seen_surface(pictured(CAMERAS, ball(0.8)), CAMERAS)
     seen = surface.covered > 0
     assert math.isclose(float(seen[0].float().mean()), math.pi * 0.8**2 / (3**2 - 0.8**2) / 4 / math.tan(0.35) ** 2,
@@ -70,6 +70,6 @@ def test_a_sphere_is_where_it_is_with_normals_outwards():
     torch.testing.assert_close(surface.z[seen], expected[seen], atol=1e-4, rtol=0)
     angle = torch.rad2deg(torch.acos((surface.normals[seen] * surface.points[seen] / 0.8).sum(-1).clamp_max(1)))
     assert angle.median() < 1
-    assert angle.max() < 20  # at the border, where half of the pixels around are missing
+    assert angle.max() < 20  # at the outline, where half of the neighbouring pixels are missing
     assert not surface.normals[~seen].any()
     assert not surface.z[~seen].any()

@@ -1,4 +1,4 @@
-"""Source of truth: brute force, every pixel's ray against every occupied voxel."""
+"""Source of truth: brute force, by marching the ray of every pixel through the voxels."""
 
 import math
 
@@ -21,7 +21,7 @@ def blobs(side, share, bounds, seed=0):
 
 
 def pixels_with_samples(grid, cameras):
-    """The pixels whose rays, walked in fine steps, meet an occupied voxel."""
+    """The pixels whose rays meet an occupied voxel, by marching in small steps."""
     height, width = int(cameras.height[0]), int(cameras.width[0])
     views = cameras.batch_size
     view = torch.arange(views).repeat_interleave(height * width)
@@ -32,7 +32,7 @@ def pixels_with_samples(grid, cameras):
 
 
 def squeezed(eye, size, focal):
-    """A camera with another focal length down than across."""
+    """A camera with different focal lengths in x and y."""
     matrix = torch.tensor([[focal[0], 0, size[1] / 2], [0, focal[1], size[0] / 2], [0, 0, 1.0]])
     return pinhole(matrix, look_at(torch.tensor([eye])), *size)
 
@@ -67,26 +67,26 @@ def test_no_pixel_that_meets_a_solid_is_missed(which):
         assert not (pixels_with_samples(grid, CAMERAS[which]) & ~footprint(grid, CAMERAS[which])).any()
 
 
-def test_far_pixels_are_left_out():
+def test_far_pixels_are_omitted():
     grid = torch.zeros(32, 32, 32, dtype=torch.bool)
-    grid[15:17, 15:17, 15:17] = True  # a sixteenth of a unit about the centre, seen from 3: about 3 of 64 pixels
+    grid[15:17, 15:17, 15:17] = True  # 1/16 in each direction from the centre, at distance 3: about 3 of 64 pixels
     live = footprint(Occupancy(grid, Sphere()), ring(4, (64, 64)))
     assert live.shape == (4, 64, 64)
     assert (live.flatten(1).sum(1) < 0.06 * 64 * 64).all()
     assert live[:, 31:33, 31:33].all()
 
 
-def test_nothing_occupied_is_seen_nowhere():
+def test_an_empty_grid_has_no_pixels():
     assert not footprint(blobs(4, 0.0, Sphere()), ring(2)).any()
 
 
-def test_everything_occupied_is_seen_where_the_cube_is():
-    camera = camera_at((0.0, 0.0, 3.0), (32, 32), angle=0.3)  # sees 0.45 to each side: the cube fills the picture
+def test_a_full_grid_covers_the_picture():
+    camera = camera_at((0.0, 0.0, 3.0), (32, 32), angle=0.3)  # shows 0.45 to each side
     assert footprint(full(Sphere(), 8), camera).all()
 
 
 @pytest.mark.parametrize("which", CAMERAS)
-def test_the_kernel_finds_what_pytorch_does(which, monkeypatch):
+def test_the_kernel_agrees_with_pytorch(which, monkeypatch):
     grid = blobs(12, 0.02, OFF_CENTRE)
     found = footprint(grid, CAMERAS[which])
     monkeypatch.setattr("hyperplanes.rendering.footprint.find_spec", lambda name: None)
@@ -94,7 +94,7 @@ def test_the_kernel_finds_what_pytorch_does(which, monkeypatch):
 
 
 def test_a_camera_without_a_pose_sees_nothing():
-    """Its pixels would be written anywhere."""
+    """Otherwise pixels could be written out of bounds."""
     camera = CAMERAS["ring"]
     lost = type(camera)(camera.intrinsics, torch.full_like(camera.extrinsics, math.nan), camera.height, camera.width)
     assert not footprint(blobs(12, 0.02, Sphere()), lost).any()

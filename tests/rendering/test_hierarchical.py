@@ -59,7 +59,7 @@ def test_samples_of_intervals_of_any_length_stay_in_them():
 
 
 def test_the_sum_over_samples_is_the_integral_on_average():
-    # density t^2 from 0 to 1 in 3 intervals: 1/3; the middles would give 35/108 = 0.324 every time
+    # the integral of t^2 from 0 to 1 is 1/3; with midpoints of 3 intervals, it would always be 35/108 = 0.324
     drawn = stratified(intervals(rays_between(0.0, 1.0, 40_000), 3), generator())
     assert (drawn.square().sum(1) / 3).mean().item() == pytest.approx(1 / 3, abs=2e-3)
 
@@ -120,8 +120,8 @@ def test_importance_passes_no_gradient_to_the_weights_but_to_the_edges():
     assert edges.grad.sum().item() == pytest.approx(3)
 
 
-def test_placement_at_samples_is_nerfs():
-    """Source of truth: NeRF's section 5.2 in NumPy, ray by ray, on a field of colour and density that vary."""
+def test_placement_at_samples_agrees_with_nerf():
+    """Source of truth: section 5.2 of NeRF in NumPy, ray by ray, with a field of varying colour and density."""
 
     def field(points, directions):
         return torch.sigmoid(3 * points), 6 * torch.exp(-4 * points.square().sum(-1))
@@ -149,7 +149,7 @@ def test_placement_at_samples_is_nerfs():
     assert found.samples == 5 * (coarse + coarse + fine)
 
 
-def test_placements_agree_where_samples_are_many_and_others_are_refused():
+def test_placements_agree_for_many_samples_and_unknown_ones_are_refused():
     def field(points, directions):
         return torch.sigmoid(3 * points), 6 * torch.exp(-4 * points.square().sum(-1))
 

@@ -1,4 +1,4 @@
-"""Gradients from samples that are drawn by their weights. Source of truth: those of all samples, in the mean."""
+"""Gradients of samples that are drawn by their weights. Source of truth: the gradients of all samples, on average."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from tests.reference_rendering import some_rays
 
 @dataclass(frozen=True)
 class Ball:
-    """A density that falls with the distance from the middle, by softplus as in networks; colours by place."""
+    """A density that decreases with the distance from the origin, through a softplus; colours depend on position."""
 
     weights: Tensor
 
@@ -44,7 +44,7 @@ def gradient_of(rendered, weights):
     return loss.detach(), torch.autograd.grad(loss, weights)[0]
 
 
-@pytest.mark.parametrize("level", [6.0, 0.0])  # of a solid, and of haze whose samples all have little weight
+@pytest.mark.parametrize("level", [6.0, 0.0])  # a solid ball, and haze whose samples all have small weights
 def test_the_mean_gradient_and_the_pixels_are_those_of_all_samples(level):
     field, weights = ball(level)
     rays, grid = some_rays(40), full(Sphere(), 4)
@@ -63,7 +63,7 @@ def test_the_mean_gradient_and_the_pixels_are_those_of_all_samples(level):
     torch.testing.assert_close(torch.stack(found).mean(0), expected, rtol=0.03, atol=0.01 * float(expected.norm()))
 
 
-def test_fewer_samples_are_differentiated_than_there_are():
+def test_not_all_samples_have_gradients():
     field, weights = ball(6.0)
     differentiated, evaluated = [], []
 
@@ -80,10 +80,10 @@ def test_fewer_samples_are_differentiated_than_there_are():
     seen = render(Counting(weights), rays, RayMarching(64), occupancy=grid, generator=torch.Generator().manual_seed(0))
     assert seen.colour.requires_grad
     assert differentiated[0] < 0.5 * len(march(rays, grid, 2 / 64))
-    assert seen.samples == sum(evaluated) - sum(differentiated)  # a call of the ball asks for `hidden` twice
+    assert seen.samples == sum(evaluated) - sum(differentiated)  # a call of the ball evaluates `hidden` twice
 
 
-def test_without_random_samples_or_an_end_of_rays_all_are_differentiated():
+def test_without_random_samples_or_stopping_all_samples_have_gradients():
     field, weights = ball(6.0)
     rays, grid = some_rays(40), full(Sphere(), 4)
     expected = gradient_of(_all_at_once(Scene(field, grid), rays, march(rays, grid, 2 / 64)), weights)
@@ -95,8 +95,8 @@ def test_without_random_samples_or_an_end_of_rays_all_are_differentiated():
     torch.testing.assert_close(gradient_of(found, weights), expected)
 
 
-def test_a_ray_none_of_whose_samples_has_a_gradient_has_the_colour_of_the_background():
-    field, _ = ball(-3.0)  # haze, of which a sample is drawn in some rays
+def test_a_ray_without_drawn_samples_has_the_colour_of_the_background():
+    field, _ = ball(-3.0)  # haze, in which only some rays have a drawn sample
     rays, grid = some_rays(40), full(Sphere(), 4)
     samples = march(rays, grid, 2 / 64)
     seen = _by_importance(Scene(field, grid, background=0.7), rays, samples, 1e-3, torch.Generator().manual_seed(0))

@@ -1,4 +1,4 @@
-"""Source of truth: a walk along each ray, step by step, that asks the grid at every one."""
+"""Source of truth: marching along each ray in a loop that tests the grid at every step."""
 
 import math
 from dataclasses import replace
@@ -20,13 +20,13 @@ def random_grid(bounds, side=6, share=0.3, seed=0):
 
 
 @pytest.mark.parametrize("stop", [-0.1, 1.0, math.nan])
-def test_a_transmittance_that_is_none_is_refused(stop):
+def test_an_invalid_transmittance_is_refused(stop):
     with pytest.raises(ValueError, match="stop: expected a transmittance from 0 to below 1"):
         RayMarching(stop=stop)
 
 
 @pytest.mark.parametrize("bounds", [Sphere(), OFF_CENTRE])
-def test_samples_are_those_of_a_walk_ray_by_ray(bounds):
+def test_samples_agree_with_a_loop_over_rays(bounds):
     grid, rays = random_grid(bounds), some_rays(40)
     found = march(rays, grid, 0.07)
     occupied = grid.occupied.tolist()
@@ -49,7 +49,7 @@ def test_samples_lie_in_occupied_voxels(seed):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_kernel_finds_what_plain_pytorch_does(dtype):
+def test_the_kernel_agrees_with_pytorch(dtype):
     grid, rays = random_grid(OFF_CENTRE, 9), some_rays(700)
     rays = Rays(*(each.to(dtype) for each in (rays.origins, rays.directions, rays.near, rays.far)))
     start, count = rays.near + 0.01, int(float((rays.far - rays.near).max()) / 0.03) + 1
@@ -58,15 +58,15 @@ def test_the_kernel_finds_what_plain_pytorch_does(dtype):
     if dtype == torch.float64:
         assert torch.equal(ray, expected_ray)
         torch.testing.assert_close(distances, expected)
-    assert abs(len(ray) - len(expected)) <= 2  # a sample within rounding of a face
+    assert abs(len(ray) - len(expected)) <= 2  # samples at a face of a voxel may differ by rounding
     assert abs(float(distances.sum() - expected.sum())) < 10
 
 
 def test_the_kernel_loses_no_sample_of_few_voxels():
-    """It begins and ends at the box around them; rays along the axes go through it, beside it and along its sides."""
+    """The kernel starts and ends at their bounding box. Rays along the axes hit it, miss it and touch its faces."""
     grid = Occupancy(torch.zeros(8, 8, 8, dtype=torch.bool), Sphere())
     grid.occupied[2:4, 5, 1] = grid.occupied[3, 6, 2] = True
-    assert grid.box == (-0.625, 0.125, -0.875, 0.125, 0.875, -0.125)  # and half a voxel more
+    assert grid.box == (-0.625, 0.125, -0.875, 0.125, 0.875, -0.125)  # with a margin of half a voxel
     places = torch.cartesian_prod(*2 * [torch.arange(-19, 20, dtype=torch.float64) / 20])  # -0.5 is one of them
     origins = torch.cat([places, torch.full_like(places[:, :1], -3.0)], 1)
     origins, others = torch.cat([origins.roll(axis, 1) for axis in range(3)]), some_rays(700)
@@ -80,7 +80,7 @@ def test_the_kernel_loses_no_sample_of_few_voxels():
     assert len(found[0]) > 1000
 
 
-def test_samples_stand_ray_by_ray_near_ones_first():
+def test_samples_are_sorted_by_ray_and_distance():
     found = march(some_rays(50), full(Sphere(), 4), 0.1, torch.Generator().manual_seed(0))
     same = found.ray.diff() == 0
     assert (found.ray.diff() >= 0).all()
@@ -108,7 +108,7 @@ def test_a_generator_shifts_each_ray_by_one_uniform_fraction_of_a_step():
     assert torch.equal(found.distances, march(rays, full(Sphere(), 2), 0.5, torch.Generator().manual_seed(0)).distances)
 
 
-def test_what_misses_has_no_samples():
+def test_rays_that_miss_have_no_samples():
     grid = full(Sphere(), 4)
     assert len(march(straight([3.0, 2.0], [3.0, 2.0]), grid, 0.1)) == 0
     assert len(march(straight([], []), grid, 0.1)) == 0
@@ -119,8 +119,8 @@ def test_what_misses_has_no_samples():
 
 
 @pytest.mark.parametrize("beside", [0.0, -1e-9, -1e-8])
-def test_the_kernel_loses_no_sample_that_rounding_moves_across_a_face(beside):
-    """A camera that looks along the first face of the voxels, and rays beside it that the grid rounds into them."""
+def test_the_kernel_loses_no_sample_at_a_face_of_the_grid(beside):
+    """A camera that looks along the first face of the voxels, with rays next to it that rounding moves inside."""
     grid = full(Sphere(), 64)
     grid.occupied[:32] = False
     rays = cast(camera_at((0.0, 0.0, -3.0), (65, 65)), torch.zeros(65 * 65, dtype=torch.long), pixel_grid(65, 65))
@@ -139,7 +139,7 @@ def test_rays_that_never_reach_the_voxels_end(slope):
     assert len(march(Rays(origins, directions, torch.tensor([2.0]), torch.tensor([4.0])), grid, 0.1)) == 0
 
 
-def test_a_ray_from_inside_looks_only_ahead():
+def test_a_ray_from_inside_has_samples_only_ahead():
     camera = camera_at((0.2, 0.0, 0.1), (3, 3), target=(1.0, 0.0, 0.0))
     rays = cast(camera, torch.zeros(9, dtype=torch.long), pixel_grid(3, 3))
     found = march(rays, full(Sphere(), 4), 0.05)
@@ -149,18 +149,18 @@ def test_a_ray_from_inside_looks_only_ahead():
     assert set(found.ray.tolist()) == set(range(9))
 
 
-def test_only_part_of_a_sphere_is_walked_beyond_it_nothing():
+def test_samples_lie_within_the_cube_of_the_grid():
     rays = some_rays(20)
     found = march(rays, full(Sphere(), 4), 0.1)
     points = rays.origins[found.ray] + found.distances[:, None] * rays.directions[found.ray]
     assert (points.abs() <= 1).all()
 
 
-def test_denser_samples_of_pictures_stay_within_what_a_sampler_takes():
+def test_the_number_of_steps_of_pictures_is_limited():
     assert RayMarching(6000).for_rendering(400).steps == 1 << 14
 
 
-def test_rays_have_an_end_and_steps_a_length_and_backward_ones_no_sample():
+def test_infinite_rays_and_zero_steps_are_refused_and_backward_rays_have_no_samples():
     for far in (math.inf, math.nan):
         with pytest.raises(ValueError, match="rays: expected finite near and far"):
             march(straight([2.0], [far]), full(Sphere(), 2), 0.5)

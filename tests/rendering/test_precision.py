@@ -1,4 +1,4 @@
-"""Source of truth: operands rounded by hand as TF32 rounds them, and PyTorch's own setting, without a GPU."""
+"""Sources of truth: operands rounded as in TF32, and PyTorch's own setting, without a GPU."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ from hyperplanes.views import Views
 from tests.reference_rendering import awaken, ball_views, ring, small_model
 
 
-def test_tf32_is_allowed_on_a_gpu_alone_and_while_the_context_lasts():
+def test_tf32_is_allowed_only_on_a_gpu_and_inside_the_context():
     before = torch.get_float32_matmul_precision()
     for name, expected in (("cpu", before), ("cuda", "high")):
         with allow_tf32(torch.device(name)):
@@ -42,8 +42,8 @@ def test_tf32_is_allowed_on_a_gpu_alone_and_while_the_context_lasts():
         assert torch.get_float32_matmul_precision() == before
 
 
-def test_of_overlapping_contexts_the_last_one_puts_the_setting_back():
-    # Those of two threads need not end in the reverse order.
+def test_the_last_of_overlapping_contexts_restores_the_setting():
+    # Contexts of two threads need not end in reverse order.
     before, gpu = torch.get_float32_matmul_precision(), torch.device("cuda")
     first, second = allow_tf32(gpu), allow_tf32(gpu)
     first.__enter__()
@@ -54,8 +54,8 @@ def test_of_overlapping_contexts_the_last_one_puts_the_setting_back():
     assert torch.get_float32_matmul_precision() == before
 
 
-def test_tf32_products_leave_pictures_as_they_are(monkeypatch):
-    # Source of truth: operands rounded to 10 bits of fraction by hand, as tensor cores read them.
+def test_tf32_products_hardly_change_pictures(monkeypatch):
+    # Source of truth: operands rounded to 10 bits of mantissa, as tensor cores do.
     model = HyperPlanes.from_pretrained("cars-64")
     model.config = replace(model.config, hull_resolution=24)
     generator = torch.Generator().manual_seed(0)
@@ -76,8 +76,8 @@ def test_tf32_products_leave_pictures_as_they_are(monkeypatch):
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_places_are_those_of_full_precision_under_autocast(monkeypatch, compiled):
-    """In bfloat16 they would be pixels away from where points are, and rotations would not be any."""
+def test_geometry_has_full_precision_under_autocast(monkeypatch, compiled):
+    """In bfloat16, projections would be wrong by pixels, and rotation matrices would not be orthogonal."""
     if not compiled:
         for module in (occupancy, footprints):
             monkeypatch.setattr(module, "find_spec", lambda name: None)
@@ -100,19 +100,19 @@ def test_places_are_those_of_full_precision_under_autocast(monkeypatch, compiled
         assert all(torch.equal(*each) for each in zip(found(), expected, strict=True))
 
 
-def test_rays_are_traced_as_without_autocast():
+def test_autocast_does_not_change_traced_rays():
     views = ball_views(ring(6, (16, 16)))
     model = HyperPlanes.from_pretrained("small")
     model.config = replace(model.config, hull_resolution=16, symmetric=False, azimuth=0.0, learned_steps=0)
     field = model.adapt(views)
-    by_pytorch = awaken(small_model()).eval().adapt(views)  # whose layers are too narrow for kernels
+    by_pytorch = awaken(small_model()).eval().adapt(views)  # layers too narrow for kernels
     for each in (by_pytorch, field, Rotation(0.3).field(field)):
         expected = each.trace(views.rays(0), differentiable=False).colour
         with torch.autocast("cpu", torch.bfloat16):
             assert torch.equal(each.trace(views.rays(0), differentiable=False).colour, expected)
 
 
-def test_fields_are_adapted_and_rendered_as_without_autocast():
+def test_autocast_does_not_change_adapting_and_rendering():
     """In bfloat16, directions of rays are wrong by most of a pixel."""
     generator = torch.Generator().manual_seed(0)
     masks = torch.zeros(9, 1, 16, 16)

@@ -1,4 +1,4 @@
-"""Source of truth: the shape that a field fills, known in closed form: all of it is kept, and little else."""
+"""Source of truth: fields with known shapes, which must be kept entirely and with few other voxels."""
 
 import math
 
@@ -14,7 +14,7 @@ def ball(radius, density=50.0):
     return lambda points: density * (points.norm(dim=-1) < radius).float()
 
 
-def test_nothing_that_is_filled_is_lost_and_little_else_is_kept():
+def test_all_of_a_ball_is_kept_and_few_other_voxels():
     # Source of truth: a ball, whose volume is known.
     grid = refine(full(Sphere(), 32), ball(0.5))
     points = torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
@@ -24,8 +24,8 @@ def test_nothing_that_is_filled_is_lost_and_little_else_is_kept():
     assert float(grid.occupied.float().mean()) * 8 < grown
 
 
-def test_a_brick_of_another_length_along_each_axis_is_kept_where_it_stands():
-    # Source of truth: the voxels whose centres lie in it, and those beside them.
+def test_a_cuboid_is_kept_at_its_place():
+    # Source of truth: the voxels whose centres are inside it, and their neighbours.
     centre, half = torch.tensor([0.3, -0.2, 0.1]), torch.tensor([0.5, 0.3, 0.2])
     centres = full(Sphere(), 32).centres()
     start, inside = (((centres - centre).abs() < half + more).all(1).view(32, 32, 32) for more in (0.13, 0.0))
@@ -40,8 +40,8 @@ def test_a_refined_grid_never_grows():
 
 
 @pytest.mark.parametrize("side", [64, 65])
-def test_a_large_grid_is_asked_coarsely_first_and_ends_the_same(side):
-    # Source of truth: the direct answer, asked in every voxel of the same large grid.
+def test_a_large_grid_is_evaluated_coarsely_first_with_the_same_result(side):
+    # Source of truth: evaluating every voxel of the large grid.
     asked = []
 
     def density(points):
@@ -58,8 +58,8 @@ def test_a_large_grid_is_asked_coarsely_first_and_ends_the_same(side):
     assert torch.equal(large.occupied, direct.dilated().occupied)
 
 
-def test_of_the_margin_what_has_no_density_towards_the_filled_voxels_is_dropped():
-    # Closed form: a ball, of which no point half a voxel deep is lost; the margin is evaluated once a voxel.
+def test_margin_voxels_without_density_near_filled_voxels_are_removed():
+    # Closed form: no point of a ball deeper than half a voxel is lost; each margin voxel is evaluated once.
     asked = []
 
     def density(points):
@@ -76,20 +76,20 @@ def test_of_the_margin_what_has_no_density_towards_the_filled_voxels_is_dropped(
     assert trimmed.contains(points[points.norm(dim=1) < 0.5 - trimmed.voxel / 2]).all()
 
 
-def test_a_field_that_is_empty_leaves_nothing():
+def test_an_empty_field_has_no_voxels():
     assert not refine(full(Sphere(), 16), lambda points: points.new_zeros(len(points))).occupied.any()
 
 
 @pytest.mark.parametrize("side", [16, 64])
-def test_what_is_dropped_is_less_opaque_than_it_may_be_whatever_the_resolution(side):
-    # Closed form: fog of density s fills the sphere; the longest ray crosses 2 r of it and is 1 - exp(-2 r s) opaque.
+def test_the_opacity_of_removed_density_is_bounded_at_any_resolution(side):
+    # Closed form: with density s in the whole sphere, the longest ray has the opacity 1 - exp(-2 r s).
     grid = full(Sphere(radius=2.0), side)
     faint = -math.log(1 - 0.05) / 4
     assert not refine(grid, lambda points: points.new_full((len(points),), 0.99 * faint)).occupied.any()
     assert refine(grid, lambda points: points.new_full((len(points),), 1.01 * faint)).occupied.all()
 
 
-def test_a_thing_one_voxel_thick_is_kept_wherever_it_lies_between_the_centres():
+def test_a_plate_one_voxel_thick_is_kept_at_any_offset_from_the_centres():
     # A tilted plate: at one end it passes through centres, at the other between them.
     grid = full(Sphere(), 32)
 
@@ -102,7 +102,7 @@ def test_a_thing_one_voxel_thick_is_kept_wherever_it_lies_between_the_centres():
 
 
 def points_of(thing, count=4000):
-    """Points inside a thing, by rejection."""
+    """Points inside a shape, by rejection sampling."""
     points = torch.rand(200 * count, 3, generator=torch.Generator().manual_seed(3)) * 1.8 - 0.9
     inside = points[thing(points) > 0]
     assert len(inside) > 50
@@ -110,7 +110,7 @@ def points_of(thing, count=4000):
 
 
 def thin_plane(voxel):
-    """A hard ball with wings half a voxel thick, tilted against all axes, and a tail that stands apart from them."""
+    """A ball with wings half a voxel thick, tilted relative to all axes, and a separate tail; without the tail, too."""
     normal = torch.nn.functional.normalize(torch.tensor([0.1, 1.0, 0.06]), dim=0)
 
     def density(points):
@@ -124,8 +124,10 @@ def thin_plane(voxel):
 
 @pytest.mark.parametrize("side", [32, 64])
 def test_hard_parts_half_a_voxel_thick_are_kept(side):
-    """Brute force: every point of wings 0.56 voxels thick, which most voxel centres miss. Without masks a grid of 64
-    voxels is asked coarsely first, and what is connected to the body is followed."""
+    """Brute force: all points of wings 0.56 voxels thick, which most voxel centres miss.
+
+    A grid of 64 voxels without masks is first evaluated coarsely; parts connected to the body are then followed.
+    """
     grid = full(Sphere(), side)
     density = thin_plane(grid.voxel)
     whole = (lambda points: density(points)[0]) if side == 32 else (lambda points: density(points)[1])
@@ -143,8 +145,8 @@ def test_hard_parts_half_a_voxel_thick_are_kept(side):
     assert sum(asked) < (9 if side == 32 else 1.5) * side**3
 
 
-def test_solid_voxels_are_those_of_the_ball_and_haze_is_none():
-    # Closed form: a ball that is opaque, in haze of half the optical depth that counts.
+def test_solid_voxels_are_those_of_the_ball_without_the_haze():
+    # Closed form: an opaque ball in haze with half of the optical depth of the threshold.
     grid = full(Sphere(), 32)
     haze = 0.015 / grid.voxel
     found = refine(grid, lambda points: ball(0.5)(points) + haze)

@@ -1,5 +1,5 @@
-"""Sources of truth: fog in a sphere in closed form, loops over single samples, gradcheck, and properties (chunks,
-company and background change no ray).
+"""Sources of truth: fog in a sphere in closed form, loops over single samples, gradcheck, and properties (chunks, other
+rays and the background do not change a ray).
 """
 
 import math
@@ -24,7 +24,7 @@ PROTOCOLS = [Hierarchical(16, 0), Hierarchical(16, 32), RayMarching(64)]
 
 
 def fog(sigma):
-    """A field of one density and colour (0.2, 0.4, 0.6) everywhere."""
+    """A field with constant density and the colour (0.2, 0.4, 0.6)."""
 
     def field(points, directions):
         return points.new_tensor([0.2, 0.4, 0.6]).expand(len(points), 3), points.new_full((len(points),), sigma)
@@ -45,7 +45,7 @@ def test_fog_in_a_sphere_in_closed_form(sampling):
     sigma, bounds = 0.7, Sphere((0.2, -0.1, 0.3), 0.8)
     rays = clipped(ring(2, (9, 7)), bounds)
     seen = render(fog(sigma), rays, sampling, occupancy=full(bounds, 8))
-    # RayMarching counts whole steps: the length is off by at most half a step of 2 r / 64
+    # RayMarching has whole steps, so that lengths differ by at most half a step of 2 r / 64
     slack = sigma * bounds.radius / 64 if isinstance(sampling, RayMarching) else 0
     assert (rays.far > rays.near).any()
     assert (rays.far == rays.near).any()
@@ -67,7 +67,7 @@ def test_marched_equals_the_loop_over_its_samples():
         t = samples.distances[samples.ray == index]
         direction = rays.directions[index].expand(len(t), 3)
         colour, density = soft_ball(rays.origins[index] + t[:, None] * direction, direction)
-        thickness = [0.0, *(density * 2 / 50).cumsum(0).tolist()]  # the gaps between live voxels let everything pass
+        thickness = [0.0, *(density * 2 / 50).cumsum(0).tolist()]  # gaps between occupied voxels are empty
         expected = composite_ray(colour.tolist(), [1.0] * len(t), thickness, 0.2)
         assert seen.colour[index].tolist() == pytest.approx(expected[0], abs=1e-9)
         assert seen.opacity[index].item() == pytest.approx(expected[1], abs=1e-9)
@@ -81,7 +81,7 @@ def test_marched_converges_to_hierarchical():
     for steps in (24, 96, 384):
         seen = render(soft_ball, rays, RayMarching(steps, 1e-9), occupancy=GRID)
         errors.append((seen.colour - truth.colour).abs().max().item())
-    # the midpoint rule: four times the steps, at least four times nearer
+    # by the midpoint rule, four times as many steps reduce the error to a quarter or less
     assert errors[1] < errors[0] / 4
     assert errors[2] < 1e-4
     seen = render(soft_ball, rays, RayMarching(384, 1e-9), occupancy=GRID)
@@ -146,7 +146,7 @@ def test_chunks_make_the_same_picture(sampling):
 
 
 def test_the_picture_is_the_same_by_any_number_of_threads():
-    """Of fields that say that several threads may call them; others are called by one, and by this one."""
+    """Thread-safe fields are called by several threads, others only by the calling thread."""
 
     @dataclass(frozen=True)
     class Ball:
@@ -174,7 +174,7 @@ def test_the_picture_is_the_same_by_any_number_of_threads():
 
 @pytest.mark.parametrize("sampling", PROTOCOLS)
 @torch.no_grad()
-def test_a_ray_sees_the_same_in_any_company(sampling):
+def test_a_ray_does_not_depend_on_other_rays(sampling):
     rays = some_rays(20)
     together = render(soft_ball, rays, sampling, occupancy=GRID).colour
     order = torch.randperm(20, generator=torch.Generator().manual_seed(0))
@@ -196,7 +196,7 @@ def test_randomness_comes_from_the_generator_alone(sampling):
     assert torch.equal(before, torch.random.get_rng_state())
 
 
-def test_the_paper_asks_the_field_at_64_and_192_samples_a_ray():
+def test_the_protocol_of_the_paper_evaluates_64_and_192_samples_per_ray():
     asked = []
 
     def counting(points, directions):
@@ -207,7 +207,7 @@ def test_the_paper_asks_the_field_at_64_and_192_samples_a_ray():
     assert sum(asked) == seen.samples == 5 * (64 + 64 + 128)
 
 
-def test_fields_are_asked_with_unit_directions_and_points_on_their_rays():
+def test_fields_are_evaluated_with_unit_directions_at_points_on_rays():
     rays = some_rays(6)
 
     def field(points, directions):
@@ -221,7 +221,7 @@ def test_fields_are_asked_with_unit_directions_and_points_on_their_rays():
         render(field, rays, sampling, occupancy=GRID)
 
 
-def test_the_proposal_draws_the_coarse_picture_and_learns_from_it():
+def test_the_proposal_renders_the_coarse_picture_and_gets_its_gradients():
     coarse = torch.tensor(0.3, dtype=DOUBLE, requires_grad=True)
     fine = torch.tensor(0.6, dtype=DOUBLE, requires_grad=True)
 
@@ -277,7 +277,7 @@ def test_gradients_of_parameters(sampling):
     bias = torch.randn(4, generator=generator, dtype=DOUBLE, requires_grad=True)
 
     def pixels(weight, bias):
-        # a proposal of its own: where the fine samples lie is no function of these parameters
+        # a separate proposal, so that the fine samples do not depend on these parameters
         seen = render(parametric(weight, bias), some_rays(3), sampling, occupancy=GRID, proposal=soft_ball)
         return seen.colour, seen.opacity, seen.depth
 
@@ -321,7 +321,7 @@ def test_gradients_of_cameras():
 
 @pytest.mark.parametrize("sampling", PROTOCOLS)
 def test_jittered_pictures_of_fog_are_those_of_fog(sampling):
-    # one density everywhere: where in its interval a sample lies makes no difference to the dense protocols
+    # with constant density, jitter within intervals does not change the dense protocols
     rays = some_rays(20)
     still = render(fog(0.7), rays, sampling, occupancy=GRID)
     jittered = render(fog(0.7), rays, sampling, occupancy=GRID, generator=torch.Generator().manual_seed(0))
@@ -329,8 +329,8 @@ def test_jittered_pictures_of_fog_are_those_of_fog(sampling):
     assert (still.opacity - jittered.opacity).abs().max() < slack
 
 
-def test_a_proposal_sees_each_ray_by_itself_and_its_whole_length():
-    # rays of 1, 2, 3 and 8 samples in fog: the proposal's opacity is that of all samples, 1 - exp(-sigma n step)
+def test_a_proposal_covers_the_whole_length_of_each_ray():
+    # rays with n = 1, 2, 3 and 8 samples in fog: the proposal has the opacity 1 - exp(-sigma n step)
     count, step = torch.tensor([1, 2, 3, 8]), 2 / 20
     straight = torch.tensor([[0.0, 0.0, 1.0]], dtype=DOUBLE).expand(4, 3)
     start = torch.tensor([[0.0, 0.0, -0.9]], dtype=DOUBLE).expand(4, 3)
@@ -348,7 +348,7 @@ def test_a_proposal_sees_each_ray_by_itself_and_its_whole_length():
 
 
 class SplitBall:
-    """A soft ball of some share of its density, whose colours are asked for after it; it counts for how many points."""
+    """A soft ball with scaled density, whose colours are evaluated after densities, counting coloured points."""
 
     def __init__(self, share):
         self.share, self.coloured, self.calls = share, 0, 0
@@ -367,24 +367,24 @@ class SplitBall:
         return soft_ball(hidden, directions)[0]
 
 
-def test_colours_of_all_rounds_are_asked_for_in_one_call():
+def test_colours_of_all_rounds_are_evaluated_in_one_call():
     split, called = SplitBall(0.1), []
     render(split, some_rays(300), RayMarching(96, 1e-3), occupancy=GRID, differentiable=False, chunk=1000)
     called.append(split.calls)
     render(split, some_rays(3), RayMarching(96, 1e-3), occupancy=GRID, differentiable=False, chunk=1000)
     called.append(split.calls - called[0])
-    assert called == [2, 1]  # a part of the rays for each thread, and one part
+    assert called == [2, 1]  # one call for each part of the rays: two parts, and one
 
 
 class Rows(list):
-    """Rows that are chosen by a tensor of indices."""
+    """A list that is indexed by a tensor of indices."""
 
     def __getitem__(self, chosen):
         return Rows(list.__getitem__(self, index) for index in chosen.tolist())
 
 
 class Unjoined(SplitBall):
-    """What it keeps of points can be indexed, and not joined."""
+    """A field whose hidden values can be indexed, but not concatenated."""
 
     def hidden(self, points):
         return Rows(points)
@@ -396,7 +396,7 @@ class Unjoined(SplitBall):
         return super().colour_of(torch.stack(list(hidden)), directions)
 
 
-def test_what_cannot_be_joined_is_asked_for_batch_by_batch():
+def test_colours_of_values_that_cannot_be_concatenated_are_evaluated_by_batch():
     rays, sampling, split = some_rays(300), RayMarching(96, 1e-3), Unjoined(0.1)
     expected = render(SplitBall(0.1), rays, sampling, occupancy=GRID, differentiable=False)
     found = render(split, rays, sampling, occupancy=GRID, differentiable=False)
@@ -405,14 +405,14 @@ def test_what_cannot_be_joined_is_asked_for_batch_by_batch():
 
 
 @pytest.mark.parametrize("share", [1.0, 0.02])
-def test_colours_that_hardly_count_are_not_asked_for(share):
-    # Another implementation: the same field as a function, all of whose colours are. In haze all samples count alike.
+def test_colours_of_samples_with_small_weights_are_not_evaluated(share):
+    # Another implementation: the field as a plain function, all of whose colours are evaluated; haze has equal weights.
     rays, split = some_rays(300), SplitBall(share)
     plain = render(lambda *given: split(*given), rays, RayMarching(96, 1e-3), occupancy=GRID, differentiable=False)
     split.coloured = 0
     found = render(split, rays, RayMarching(96, 1e-3), occupancy=GRID, differentiable=False)
     error = found.colour - plain.colour
-    assert error.abs().max() < 0.05 * 0.25  # the share that is left out, by how far its colours can be from the mean
+    assert error.abs().max() < 0.05 * 0.25  # the omitted weight times the largest deviation of its colour
     torch.testing.assert_close(found.opacity, plain.opacity)
     torch.testing.assert_close(found.depth, plain.depth)
     assert found.samples == plain.samples
@@ -420,8 +420,8 @@ def test_colours_that_hardly_count_are_not_asked_for(share):
 
 
 @torch.no_grad()
-def test_a_ray_that_is_stopped_is_opaque_and_has_the_colour_of_what_it_met():
-    # Closed form: fog of one colour before black, which a ray that goes on still sees a little of.
+def test_a_stopped_ray_is_opaque_with_the_colour_of_its_samples():
+    # Closed form: fog with one colour in front of black, of which rays that continue have a small part.
     rays = some_rays(30)
     stopped = render(fog(20.0), rays, RayMarching(64, 0.2), occupancy=GRID, differentiable=False, background=0.0)
     opaque = stopped.opacity > 1 - 1e-5
@@ -433,8 +433,8 @@ def test_a_ray_that_is_stopped_is_opaque_and_has_the_colour_of_what_it_met():
 
 @pytest.mark.parametrize("split", [False, True])
 @torch.no_grad()
-def test_pictures_evaluate_every_second_sample_and_those_between_where_they_matter(split):
-    # Closed form: fog in a ball of radius 0.5, which steps cut too long or too short; and every sample of the rays.
+def test_pictures_evaluate_every_second_sample_and_others_where_needed(split):
+    # Closed form: fog in a ball of radius 0.5, compared with every second and with every sample of the rays.
     class Fog(SplitBall):
         def density_of(self, hidden):
             return 8.0 * (hidden.norm(dim=-1) < 0.5)
@@ -489,7 +489,7 @@ def test_a_lambda_and_a_kornia_camera_make_a_picture():
 
 
 @pytest.mark.parametrize("sampling", PROTOCOLS)
-def test_a_picture_is_the_pixels_of_its_rays(sampling):
+def test_pixels_of_a_picture_agree_with_its_rays(sampling):
     cameras, bounds = ring(1, (6, 5)), Sphere((0.1, 0.0, -0.1), 0.9)
     picture = render(soft_ball, cameras, sampling, bounds=bounds, background=0.3, antialias=False)
     rays = cast(cameras, torch.zeros(30, dtype=torch.long), pixel_grid(6, 5), bounds, near_far=sampling.near_far)
@@ -499,7 +499,7 @@ def test_a_picture_is_the_pixels_of_its_rays(sampling):
     assert picture.samples == seen.samples
 
 
-def test_rays_alone_are_rendered_by_the_papers_sampler():
+def test_rays_without_bounds_are_rendered_by_the_sampler_of_the_paper():
     rays = some_rays(4)
     assert torch.equal(render(soft_ball, rays).colour, render(soft_ball, rays, Hierarchical()).colour)
     marched = render(soft_ball, rays, bounds=Sphere()).colour
@@ -525,7 +525,7 @@ def test_a_field_with_values_of_another_shape_is_named():
         render(lambda points, _: (points, points[:, :1]), ring(1))
 
 
-def test_samplers_say_what_they_need():
+def test_properties_of_samplers():
     for sampling in PROTOCOLS:
         assert isinstance(sampling, Sampler)
     assert RayMarching(60, 0.1).for_rendering(100) == RayMarching(100, 0.1)

@@ -1,4 +1,4 @@
-"""Source of truth: autograd through the voxels as a callable, rendered by the generic renderer at the same samples."""
+"""Source of truth: autograd through the same voxels, as a field in the generic renderer with the same samples."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from hyperplanes.rendering.voxels import VoxelGrid, voxel_gradients
 
 
 @pytest.mark.parametrize("counts", [None, [1, 5, 2] * 16])
-def test_the_compiled_gradient_is_that_of_autograd(counts):
+def test_the_compiled_gradient_agrees_with_autograd(counts):
     generator = torch.Generator().manual_seed(0)
     filled = torch.rand(8, 8, 8, generator=generator) < 0.4
     index = torch.full((8, 8, 8), -1, dtype=torch.int32)

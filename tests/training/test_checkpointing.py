@@ -1,4 +1,4 @@
-"""Source of truth: the weights that a training had when it wrote a file, to the bit."""
+"""Source of truth: the exact weights that a training had when it wrote a file."""
 
 import shutil
 from dataclasses import replace
@@ -19,7 +19,7 @@ def same(one, other):
     return set(one) == set(other) and all((one[name] == other[name]).all() for name in one)
 
 
-def test_the_last_states_are_kept_and_a_training_goes_on_from_any_of_them(tmp_path):
+def test_the_last_states_are_kept_and_any_can_be_resumed(tmp_path):
     states = {}
 
     class Noted(Trainer):
@@ -63,9 +63,9 @@ def test_the_best_model_is_that_of_the_validation_with_the_highest_quality(tmp_p
 
     judged(5, tmp_path / "whole")
     best = HyperPlanes.from_pretrained(tmp_path / "whole" / "best").state_dict()
-    assert same(best, weights[1])  # the first of two that are alike
+    assert same(best, weights[1])  # the first of two that are equal
     assert not same(best, weights[3])
 
-    for steps in (3, 5):  # resumed after the best look
+    for steps in (3, 5):  # resumed after the best validation
         judged(steps, tmp_path / "parts")
     assert same(HyperPlanes.from_pretrained(tmp_path / "parts" / "best").state_dict(), best)

@@ -1,4 +1,4 @@
-"""Source of truth: the gradients of a step whose rates are zero, and their norm summed by hand."""
+"""Source of truth: the gradients of a step with rates of zero, and their norm computed by hand."""
 
 import math
 from dataclasses import replace
@@ -12,7 +12,7 @@ from tests.reference_rendering import Balls, awaken, small_model
 CONFIG = TrainingConfig(steps=6, tasks=2, rays=16, evaluate_every=2, checkpoint_every=100, learning_rate=1e-2)
 
 
-def test_gradients_are_clipped_by_their_norm_over_all_weights_that_move():
+def test_gradients_are_clipped_by_their_norm_over_all_trained_weights():
     free, clipped = (
         Trainer(awaken(small_model()), Balls(), replace(CONFIG, clip=clip, learning_rate=0.0)) for clip in (0.0, 0.01)
     )
@@ -29,6 +29,6 @@ def test_gradients_are_clipped_by_their_norm_over_all_weights_that_move():
     assert math.hypot(norms["gradient_theta"], norms["gradient_hypernetwork"]) == pytest.approx(0.01, rel=1e-3)
 
 
-def test_a_norm_that_means_nothing_is_refused():
+def test_an_invalid_norm_is_refused():
     with pytest.raises(ValueError, match=r"clip: .*got -1\.0"):
         replace(CONFIG, clip=-1.0)

@@ -1,4 +1,4 @@
-"""Source of truth: a training in one process, which two that share its objects repeat to rounding, in float64."""
+"""Source of truth: a training in one process. Two processes repeat it in float64, except for rounding."""
 
 import subprocess
 import sys
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def joined(tmp_path_factory):
-    """The folder in which two processes have trained; and how the first one ended."""
+    """The folder in which two processes trained, and the result of the first process."""
     folder = tmp_path_factory.mktemp("joined")
     begun = normalised(folder / "normalised")
     for _ in range(2):
@@ -33,7 +33,7 @@ def joined(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_two_processes_train_what_one_does(joined, name):
+def test_two_processes_train_the_weights_of_one(joined, name):
     folder, _ = joined
     alone = KINDS[name]()
     list(alone.run())
@@ -47,8 +47,8 @@ def test_two_processes_train_what_one_does(joined, name):
     assert row == pytest.approx(alone.curve[-1], rel=1e-4)
 
 
-def test_a_checkpoint_of_one_process_goes_on_in_two(joined):
-    # test_two_processes_train_what_one_does holds its weights: two of its four steps were taken by one process
+def test_a_checkpoint_of_one_process_is_resumed_in_two(joined):
+    # test_two_processes_train_the_weights_of_one checks its weights; one process took two of its four steps
     folder, _ = joined
     saved = read_json(folder / "normalised" / "training.json")
     assert saved["step"] == 4
@@ -57,9 +57,9 @@ def test_a_checkpoint_of_one_process_goes_on_in_two(joined):
     assert all(torch.equal(trained[key].float(), value) for key, value in model.state_dict().items())
 
 
-def test_a_process_that_is_killed_ends_the_other_and_its_checkpoint_goes_on_in_one(joined):
+def test_a_killed_process_ends_the_other_and_its_checkpoint_is_resumed_in_one(joined):
     folder, done = joined
-    assert done.returncode in (2, -9)  # by itself, or by Fabric, which kills whom it finds waiting
+    assert done.returncode in (2, -9)  # by an error, or by Fabric, which kills waiting processes
     if done.returncode == 2:
         assert done.stderr.strip().endswith(
             "another process of this training has ended; see the message of that process"
@@ -79,7 +79,7 @@ def test_a_process_that_is_killed_ends_the_other_and_its_checkpoint_goes_on_in_o
     assert [row["psnr"] for row in resumed.curve] == pytest.approx([row["psnr"] for row in whole.curve], abs=0.01)
 
 
-def test_a_stop_that_one_process_is_asked_for_ends_both_after_the_same_step(joined):
+def test_a_signal_to_one_process_ends_both_after_the_same_step(joined):
     folder, _ = joined
     first, second = (read_json(folder / f"told-{rank}.json") for rank in range(2))
     assert first["step"] == second["step"] == 2
@@ -106,11 +106,11 @@ def test_objects_that_cannot_be_shared_evenly_are_refused(joined):
         check_shares(4, 3, 4)
 
 
-def test_torchrun_says_how_many_processes_there_are(monkeypatch):
+def test_the_number_of_processes_is_read_from_torchrun(monkeypatch):
     assert count_processes(3, 1) == (3, 1)
     assert is_first_process(1)
     monkeypatch.setenv("NODE_RANK", "1")
-    assert is_first_process(1)  # nothing else takes part
+    assert is_first_process(1)  # there is no other process
     assert not is_first_process(2)
     with pytest.raises(ValueError, match="--nodes: .*NODE_RANK .0 to 1. in the environment .*, got no MASTER_ADDR"):
         count_processes(1, 2)
@@ -123,14 +123,14 @@ def test_torchrun_says_how_many_processes_there_are(monkeypatch):
         count_processes(2, 1)
 
 
-def test_a_process_that_ends_in_an_error_leaves_its_group():
+def test_a_process_that_ends_with_an_error_leaves_its_group():
     distributed.init_process_group("gloo", store=distributed.HashStore(), rank=0, world_size=1)
     _leave()
     assert not distributed.is_initialized()
-    _leave()  # where there is none, too
+    _leave()  # also without a group
 
 
-def test_shares_are_all_values_in_their_order():
+def test_shares_together_are_all_values_in_order():
     values = list(range(12))
     for count in (1, 2, 3, 4, 6):
         assert [each for rank in range(count) for each in Processes(rank, count).share(values)] == values

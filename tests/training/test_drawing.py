@@ -1,4 +1,4 @@
-"""Source of truth: counting what is drawn; generators of other places, steps and seeds that draw something else."""
+"""Source of truth: counts of what is drawn. Generators of other places, steps and seeds draw other numbers."""
 
 import json
 from collections import Counter
@@ -29,19 +29,19 @@ def test_classes_are_drawn_equally_often_whatever_their_size(count):
         for name, members in CLASSES.items():
             assert len({*drawn} & {*members}) == min(of_step[name], len(members))
         found += Counter(drawn)
-    for members in CLASSES.values():  # each object is one of its class: binomial, five standard deviations
+    for members in CLASSES.values():  # binomial, within five standard deviations
         expected = steps * count / 3 / len(members)
         assert all(abs(found[each] - expected) < 5 * expected**0.5 for each in members)
 
 
-def test_one_class_is_drawn_from_as_all_objects_are():
+def test_with_a_single_class_all_objects_are_drawn_equally_often():
     names = CLASSES["car"]
     drawn = draw_balanced({"": names}, 5, torch.Generator().manual_seed(0))
     assert len(set(drawn)) == 5
     assert len(set(draw(names, 5, torch.Generator().manual_seed(0)))) == 5
 
 
-def test_the_draws_of_an_object_are_those_of_its_seed_step_and_place():
+def test_random_numbers_of_an_object_depend_on_seed_step_and_place():
     draws = {
         key: torch.rand(4, generator=object_generator(*key)).tolist()
         for key in ((0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 1, 1))
@@ -50,9 +50,9 @@ def test_the_draws_of_an_object_are_those_of_its_seed_step_and_place():
     assert len({tuple(each) for each in draws.values()}) == len(draws)
 
 
-def test_an_object_alone_in_a_step_has_the_rays_that_it_has_beside_others():
+def test_the_rays_of_an_object_do_not_depend_on_other_objects_of_the_step():
     def left(tasks):
-        """The generators of a step after it."""
+        """The states of a step's generators after the step."""
         trainer = Trainer(small_model(hypernetwork=None), Balls(3), TrainingConfig(tasks=tasks, rays=8))
         names = [f"train{place}" for place in range(tasks)]
         generators = [object_generator(0, 0, place) for place in range(tasks)]
@@ -64,7 +64,7 @@ def test_an_object_alone_in_a_step_has_the_rays_that_it_has_beside_others():
     assert not torch.equal(left(1)[0], object_generator(0, 0, 0).get_state())
 
 
-def test_classes_are_those_of_the_manifest_or_else_of_the_data_sets(tmp_path):
+def test_classes_are_read_from_the_manifest_or_from_the_data_sets(tmp_path):
     for part, objects in (
         ("mixed", {"a": {"class": "car"}, "b": {"class": "lamp"}}),
         ("plain", {"a": {"class": None}}),

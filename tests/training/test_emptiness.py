@@ -1,4 +1,4 @@
-"""Source of truth: the opacity of a constant density in closed form, and what share of a ball a half grid covers."""
+"""Source of truth: closed forms of the opacity of a constant density, and of the share of a ball in half a grid."""
 
 import math
 from types import SimpleNamespace
@@ -18,7 +18,7 @@ DENSITY = 2.5
 @pytest.mark.parametrize(("occupied", "share"), [(0, 1.0), (8, 0.5), (16, 0.0)])
 @pytest.mark.parametrize("networks", [1, 2])
 @pytest.mark.parametrize("unit", [1.0, 50.0])
-def test_a_constant_density_counts_outside_the_hull_alone_in_every_unit(occupied, share, networks, unit):
+def test_only_density_outside_the_hull_counts_in_every_unit(occupied, share, networks, unit):
     bounds = Sphere((3.0 * unit, 0.0, -unit), 2 * unit)
     voxels = torch.zeros(16, 16, 16, dtype=torch.bool)
     voxels[:occupied] = True

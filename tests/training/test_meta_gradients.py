@@ -1,4 +1,4 @@
-"""Source of truth: linear regression, whose gradient steps are computed by hand, and finite differences."""
+"""Source of truth: gradient steps of a linear regression, computed by hand, and finite differences."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ QUERY_X, QUERY_Y = torch.tensor([0.5, -2.0]), torch.tensor([1.0, 1.0])
 
 
 def squared_error(x, y):
-    """Mean of (w x - y)^2, whose slope in w is 2 mean(x (w x - y))."""
+    """Mean of (w x - y)^2, with derivative 2 mean(x (w x - y)) with respect to w."""
     return lambda parameters: (parameters["w"] * x - y).square().mean()
 
 
@@ -25,7 +25,7 @@ def slope(w, x, y):
 
 @pytest.mark.parametrize("steps", [0, 1, 3])
 def test_maml_on_a_line_through_zero(steps):
-    # each step is w' = w - rate slope(w), so dw'/dw = 1 - 2 rate mean(x^2), the same at every step
+    # a step is w' = w - rate derivative(w), so that dw'/dw = 1 - 2 rate mean(x^2) at every step
     w = torch.tensor(0.7)
     after = w.clone()
     for _ in range(steps):
@@ -41,7 +41,7 @@ def test_maml_on_a_line_through_zero(steps):
 
 
 def test_reptile_on_a_line_through_zero():
-    # K steps shrink w - w* by (1 - 2 rate mean(x^2))^K, where w* = mean(x y) / mean(x^2); the mean is over two objects
+    # K steps multiply w - w* by (1 - 2 rate mean(x^2))^K, with w* = mean(x y) / mean(x^2); then the mean of two objects
     w, adapted, expected = torch.tensor(0.7), [], []
     for x, y in ((X, Y), (QUERY_X, QUERY_Y)):
         here = w.clone()
@@ -54,7 +54,7 @@ def test_reptile_on_a_line_through_zero():
 
 
 @pytest.mark.parametrize("target", ["nerf", "point_multiplane"])
-def test_maml_through_a_rendered_field_against_finite_differences(target):
+def test_the_gradient_of_maml_through_a_renderer_is_that_of_finite_differences(target):
     model = small_model(hypernetwork=None, target=target).double()
     prepared = model.prepare(ball_views(ring(4)))
     generator = torch.Generator().manual_seed(0)
@@ -79,7 +79,7 @@ def test_maml_through_a_rendered_field_against_finite_differences(target):
     assert not torch.isclose(without, expected, rtol=1e-3)
 
 
-def test_shuffled_weights_are_the_same_numbers_in_another_place():
+def test_shuffled_weights_are_a_permutation():
     model = small_model(hypernetwork=None)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     one, again, other = shuffled(model), shuffled(model), shuffled(model, seed=1)
@@ -93,7 +93,7 @@ def test_shuffled_weights_are_the_same_numbers_in_another_place():
             assert not torch.equal(mixed, other.networks.get_parameter(name))
 
 
-def test_descent_is_plain_and_of_constant_rate_unless_told_otherwise():
+def test_descent_is_plain_with_a_constant_rate_by_default():
     config = InitialisationConfig(inner_rate=0.3, test_rays=17)
     settings = config.descent()
     assert (settings.optimiser, settings.learning_rate, settings.rays, settings.trainable) == (

@@ -1,4 +1,4 @@
-"""Source of truth: autograd and a loop beside the trainers, bitwise equality of resumed trainings, poisoned pixels."""
+"""Source of truth: autograd and a separate loop, bitwise equality of resumed trainings, and pixels that are NaN."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def model_of(method, **changes):
 
 
 def gradients_of(trainer):
-    """The gradient of the first step, before an optimiser sees it."""
+    """The gradient of the first step, before the step of the optimiser."""
     for optimiser in trainer.optimisation.optimisers:
         optimiser.step = lambda: None
     trainer.take_step()
@@ -76,8 +76,8 @@ def test_one_inner_step_of_reptile_is_a_gradient_step_on_support_rays():
 
 
 @pytest.mark.parametrize("coarse", [False, True])
-def test_inner_steps_of_rate_zero_lead_nowhere(coarse):
-    changes = {"sampling": RayMarching(12, stop=0.0)}  # no gradient is an estimate, as in maml alone
+def test_inner_steps_of_rate_zero_change_nothing(coarse):
+    changes = {"sampling": RayMarching(12, stop=0.0)}  # all gradients are exact, as in maml
     if coarse:
         changes = {"coarse_network": True, "sampling": Hierarchical(6, 6)}
 
@@ -98,8 +98,8 @@ def test_inner_steps_of_rate_zero_lead_nowhere(coarse):
 
 
 @pytest.mark.parametrize("method", ["maml", "mv_meta"])
-def test_an_object_that_is_drawn_twice_has_the_gradient_and_the_loss_of_one(method):
-    """The gradient of a step is the mean over its objects, by which no rate depends on how many they are."""
+def test_an_object_drawn_twice_has_the_gradient_and_the_loss_of_one(method):
+    """The gradient of a step is the mean over its objects, so that rates do not depend on their number."""
     trainer = initialisation_trainer(model_of(method), Balls(), FAST, None)
     batch = trainer.loader.batch(0)
 
@@ -115,7 +115,7 @@ def test_an_object_that_is_drawn_twice_has_the_gradient_and_the_loss_of_one(meth
         torch.testing.assert_close(twice[name], value)
 
 
-def test_a_single_view_an_object_is_all_that_sv_meta_sees():
+def test_sv_meta_uses_a_single_view_per_object():
     data, poisoned = Balls(), Balls()
     clean = data.task
 
@@ -136,7 +136,7 @@ def test_a_single_view_an_object_is_all_that_sv_meta_sees():
     assert [one.take_step(), one.take_step()] == [other.take_step(), other.take_step()]
 
 
-def test_matching_makes_the_outputs_of_the_reference(tmp_path):
+def test_matching_learns_the_outputs_of_the_reference(tmp_path):
     model_of("mv_meta").save(tmp_path)
     config = replace(FAST, steps=80, tasks=1, rays=128, learning_rate=1e-2)
     trainer = start_training(model_of("mv_matched").config, config, Balls(), tmp_path / "out", reference=tmp_path)
@@ -145,7 +145,7 @@ def test_matching_makes_the_outputs_of_the_reference(tmp_path):
     assert sum(losses[-5:]) < 0.1 * sum(losses[:5])
 
 
-def test_a_reference_that_does_not_fit_is_refused(tmp_path):
+def test_a_reference_of_another_architecture_is_refused(tmp_path):
     model = model_of("mv_matched")
     with pytest.raises(ValueError, match="mv_matched: expected a checkpoint of mv_meta to match, got none"):
         initialisation_trainer(model, Balls(), FAST, None)
@@ -156,7 +156,7 @@ def test_a_reference_that_does_not_fit_is_refused(tmp_path):
         initialisation_trainer(model, Balls(), FAST, None, other)
 
 
-def test_matching_goes_on_with_the_reference_that_it_began_with(tmp_path):
+def test_matching_is_resumed_with_its_reference(tmp_path):
     model_of("mv_meta").save(tmp_path / "one")
     other = model_of("mv_meta")
     with torch.no_grad():
@@ -172,7 +172,7 @@ def test_matching_goes_on_with_the_reference_that_it_began_with(tmp_path):
         start_training(begin, longer, Balls(), tmp_path / "out", reference=tmp_path / "other")
 
 
-def test_planes_are_hidden_by_no_learned_initialisation():
+def test_learned_initialisations_refuse_plane_dropout():
     model = model_of("mv_meta")
     model.config = replace(model.config, plane_dropout=0.5)
     with pytest.raises(ValueError, match="model.plane_dropout: expected 0 for mv_meta"):
@@ -180,18 +180,18 @@ def test_planes_are_hidden_by_no_learned_initialisation():
 
 
 @pytest.mark.parametrize(("name", "value"), [("random_background", True), ("empty_points", 64), ("antialias", True)])
-def test_what_inner_steps_do_not_do_is_refused(name, value):
+def test_settings_that_inner_steps_do_not_support_are_refused(name, value):
     with pytest.raises(ValueError, match=f"training.{name}: expected .* for mv_meta"):
         initialisation_trainer(model_of("mv_meta"), Balls(), replace(FAST, **{name: value}), None)
 
 
-def test_a_field_of_any_number_of_views_is_not_trained_on_a_single_one_an_object():
+def test_a_field_of_any_number_of_views_is_not_trained_on_one_view_per_object():
     model = HyperPlanes(replace(MODEL, hypernetwork=None, initialisation=InitialisationConfig("sv_meta")))
     with pytest.raises(ValueError, match="sv_meta: expected a field with a fixed number of views, got image_based"):
         initialisation_trainer(model, Balls(), FAST, None)
 
 
-def test_gradient_steps_from_an_initialisation_are_plain_descent_unless_an_optimiser_is_stated():
+def test_gradient_steps_from_an_initialisation_are_plain_descent_by_default():
     config, given = InitialisationConfig(inner_rate=0.3), FineTuning(learning_rate=0.1, final_rate_factor=0.2, seed=4)
     for rate, settings in ((0.3, config.descent()), (0.1, config.descent(given=given))):
         assert (settings.optimiser, settings.learning_rate, settings.final_rate_factor) == ("sgd", rate, 1.0)
@@ -199,7 +199,7 @@ def test_gradient_steps_from_an_initialisation_are_plain_descent_unless_an_optim
     assert (adam.optimiser, adam.learning_rate, adam.final_rate_factor, adam.seed) == ("adam", 0.1, 0.2, 4)
 
 
-def test_objects_in_another_order_have_the_same_results_and_the_initialisation_stays_as_it_is():
+def test_results_do_not_depend_on_the_order_of_objects_and_the_initialisation_is_unchanged():
     model, data = model_of("mv_meta"), Balls(test=2)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     settings = model.config.initialisation.descent()
@@ -214,8 +214,8 @@ def test_objects_in_another_order_have_the_same_results_and_the_initialisation_s
 
 
 @pytest.mark.parametrize(("method", "rate"), [("mv_meta", 0.02), ("maml", 0.01)])
-def test_what_is_learned_helps_on_an_object_that_was_not_trained_on(method, rate):
-    # Taking away: the same weights in random order, and those before the training, after as many steps on the object.
+def test_a_learned_initialisation_helps_on_a_new_object(method, rate):
+    # Ablation: the same weights in random order, and those before the training, after equally many steps on the object.
     data, untrained, model = Balls(), model_of(method, inner_rate=0.1), model_of(method, inner_rate=0.1)
     trainer = initialisation_trainer(model, data, replace(FAST, steps=30, learning_rate=rate), None)
     for _ in range(30):
@@ -230,7 +230,7 @@ def test_what_is_learned_helps_on_an_object_that_was_not_trained_on(method, rate
     assert reached > quality(untrained) + 1
 
 
-def test_too_few_support_views_are_told_the_number_that_can_be_trained_with(tmp_path):
+def test_with_too_few_support_views_the_error_states_the_possible_number(tmp_path):
     def model(planes, views=2):
         return HyperPlanes(replace(config, network=replace(config.network, planes=planes), hypernetwork=reading(views)))
 
@@ -254,8 +254,8 @@ def test_too_few_support_views_are_told_the_number_that_can_be_trained_with(tmp_
     assert start(8, 8, WithSupport(Balls(), 8)).model.rig.shape == (8, 3)
 
 
-def test_a_field_without_planes_takes_all_support_views_however_many(tmp_path):
-    """Unless an autoencoder reads views by their places. Of 25 planes it loads as well."""
+def test_a_field_without_planes_takes_any_number_of_support_views(tmp_path):
+    """Except where an autoencoder reads views by their positions. A checkpoint with 25 planes also loads."""
     network = replace(small_model().config.network, planes=25)
     earlier = HyperPlanes(replace(model_of("mv_meta").config, network=network))
     earlier.rig.fill_(1.0)
@@ -270,21 +270,21 @@ def test_a_field_without_planes_takes_all_support_views_however_many(tmp_path):
         start_training(read, FAST, Balls(), tmp_path / "read")
 
 
-def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not_fit(tmp_path):
+def test_a_training_begins_with_the_weights_of_a_checkpoint_or_names_those_that_do_not_fit(tmp_path):
     given = small_model()
     torch.nn.init.normal_(given.networks.fine.colour.weight)
     given.save(tmp_path / "given")
     trainer = start_training(given.config, FAST, Balls(), tmp_path / "out", reference=tmp_path / "given")
     for name, value in given.networks.state_dict().items():
         assert torch.equal(trainer.model.networks.state_dict()[name], value), name
-    elsewhere = Balls(views=5)  # whose first views stand elsewhere; the weights know each plane by its place
+    elsewhere = Balls(views=5)  # its first views have other poses, but the weights depend on the poses of the planes
     kept = start_training(given.config, FAST, elsewhere, tmp_path / "kept", reference=tmp_path / "given")
     assert torch.equal(kept.model.rig, given.rig)
     assert not torch.equal(start_training(given.config, FAST, elsewhere, tmp_path / "new").model.rig, given.rig)
     trainer.take_step()
     trainer.save()
     resumed = start_training(given.config, FAST, Balls(), tmp_path / "out", reference=tmp_path / "given")
-    assert resumed.step == 1  # an interrupted training goes on from where it was, not from there
+    assert resumed.step == 1  # an interrupted training is resumed; it does not begin anew
     small_model().save(tmp_path / "others")
     with pytest.raises(
         ValueError, match="checkpoint: expected what the training in .* began with, .*given, got .*others"
@@ -294,7 +294,7 @@ def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not
         assert torch.equal(resumed.model.state_dict()[name], value), name
 
     wider = replace(given.config, network=replace(given.config.network, width=32))
-    wider = replace(wider, hull_resolution=32, sampling=Hierarchical(4, 4))  # neither decides on weights
+    wider = replace(wider, hull_resolution=32, sampling=Hierarchical(4, 4))  # neither changes the shapes of weights
     expected = "expected weights of the configured model, .* got .*given, hyperplanes of .* differs in {}; give {}$"
     remedy = "the --preset or --config that it was trained by"
     with pytest.raises(ValueError, match=expected.format("network.width", remedy)):
@@ -305,17 +305,17 @@ def test_a_training_begins_with_the_weights_of_a_checkpoint_or_says_which_do_not
         start_training(plain, FAST, Balls(), tmp_path / "other", reference=tmp_path / "given")
 
 
-def test_a_validation_whose_steps_lower_nothing_does_not_end_the_training():
+def test_a_validation_without_a_decreasing_loss_does_not_end_the_training():
     model = model_of("mv_meta")
     with torch.no_grad():
         model.networks["fine"].density.weight.zero_()
-        model.networks["fine"].density.bias.fill_(-60.0)  # empty, and without a gradient
+        model.networks["fine"].density.bias.fill_(-60.0)  # an empty field without a gradient
     trainer = initialisation_trainer(model, Balls(), replace(FAST, steps=1), None)
     assert [row.psnr for row in trainer.run()][-1] is not None
 
 
-def test_maml_takes_no_estimate_of_gradients_and_its_first_order_form_does():
-    """Second derivatives of an estimate are wrong even in the mean; `stop` chooses the samples with a gradient."""
+def test_maml_refuses_estimated_gradients_and_first_order_maml_takes_them():
+    """Second derivatives of estimated gradients are biased. `stop` chooses the samples that have a gradient."""
 
     def found(method, stop):
         model = model_of(method)

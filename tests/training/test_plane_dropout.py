@@ -1,4 +1,4 @@
-"""Source of truth: taking away. A field trained with dropout of planes does without some; without it, it does not."""
+"""Source of truth: ablation. Only a field that was trained with plane dropout keeps its quality without some planes."""
 
 from itertools import combinations
 
@@ -25,7 +25,7 @@ def trained(dropout):
 
 
 def qualities(model):
-    """PSNR of views of held-out balls in dB: with all planes, the mean with each one hidden, and with each two."""
+    """PSNR in dB for held-out balls: with all planes, and the means with each one and with each two planes hidden."""
     tasks = [DATA.task(name) for name in ("test0", "test1")]
     contexts = [model.prepare(task.support) for task in tasks]
     queries = [task.query[::2] for task in tasks]
@@ -43,7 +43,7 @@ def qualities(model):
     return [torch.stack(list(map(quality, combinations(range(count), hidden)))).mean() for hidden in range(3)]
 
 
-def test_a_field_trained_with_dropout_does_without_some_planes():
+def test_a_field_trained_with_dropout_keeps_its_quality_without_some_planes():
     (all_planes, one_hidden, two_hidden), without = qualities(trained(0.3)), qualities(trained(0.0))
     assert all_planes > without[0] - 0.5  # measured: 0.2 dB better
     assert one_hidden > without[1] + 0.5  # measured: 1.0 dB
@@ -51,7 +51,7 @@ def test_a_field_trained_with_dropout_does_without_some_planes():
 
 
 @pytest.mark.parametrize("order", ["matched", "file"])
-def test_where_there_are_fewer_views_than_planes_each_stands_at_one_plane_and_the_others_are_hidden(order):
+def test_with_fewer_views_than_planes_each_is_one_plane_and_the_others_are_hidden(order):
     support, seen = DATA.task("test0").support, torch.tensor([2, 0])
     filled, dropped = (
         small_model(hypernetwork=None, plane_dropout=chance, order=order).prepare(support[seen]) for chance in (0, 0.3)
@@ -62,13 +62,13 @@ def test_where_there_are_fewer_views_than_planes_each_stands_at_one_plane_and_th
         == {"matched": [False, True, False, True], "file": [False, False, True, True]}[order]
     )
     assert torch.equal(filled.views.images, dropped.views.images)
-    both = dropped.mask_views(torch.tensor([0]))  # what is hidden stays so
+    both = dropped.mask_views(torch.tensor([0]))  # hidden planes stay hidden
     assert both.planes.masked.sum() == 3
     assert small_model(hypernetwork=None, plane_dropout=0.3, order=order).prepare(support).planes.masked is None
 
 
 @pytest.mark.parametrize("target", ["nerf", "image_based"])
-def test_fields_without_a_plane_at_a_place_of_its_own_take_no_dropout(target):
+def test_fields_without_individual_planes_refuse_dropout(target):
     network = find_targets()[target].config_type()
     with pytest.raises(ValueError, match=f"plane_dropout: .* got {target}"):
         HyperPlanes(ModelConfig(target=target, network=network, hypernetwork=None, plane_dropout=0.1))

@@ -1,4 +1,4 @@
-"""Rotation of episodes. Source of truth: projection of rotated points, and volumes of the rotated views."""
+"""Rotation of episodes. Source of truth: projections of rotated points, and volumes of rotated views."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,7 @@ from tests.reference_rendering import Balls
 from tests.training.test_volume_loss import MODEL, TRAINING
 
 
-def test_rotated_cameras_see_rotated_points_where_the_others_saw_them():
+def test_rotated_cameras_project_rotated_points_to_the_same_pixels():
     views = Balls(views=5).task("train0").support
     views = replace(views, bounds=Sphere((0.3, -0.2, 0.1), 0.8))
     rotated = Rotation(0.7).views(views)
@@ -27,7 +27,7 @@ def test_rotated_cameras_see_rotated_points_where_the_others_saw_them():
     cos, sin = torch.cos(torch.tensor(0.7)), torch.sin(torch.tensor(0.7))
     x, y, z = (points - axis).unbind(1)
     moved = torch.stack([cos * x + sin * z, y, -sin * x + cos * z], 1) + axis
-    assert torch.allclose(moved[0], points[0])  # a point of the axis stays
+    assert torch.allclose(moved[0], points[0])  # a point of the axis does not move
     for one, other in ((views, points), (rotated, moved)):
         pixels = one.cameras.project(other[None].expand(len(one), -1, -1))
         expected = pixels if one is views else expected
@@ -38,7 +38,7 @@ def test_rotated_cameras_see_rotated_points_where_the_others_saw_them():
 @pytest.mark.parametrize("angle", [0.5, 2.0, 4.4])
 def test_a_rotated_volume_is_that_of_the_rotated_views(angle):
     model, task = HyperPlanes(MODEL), Balls(views=16, size=(40, 40)).task("train0")
-    beside = Sphere((0.4, 0.0, 0.2))  # the ball is not in the middle of the scene
+    beside = Sphere((0.4, 0.0, 0.2))  # the ball is not at the centre of the scene
     task = Task(*(replace(part, bounds=beside) for part in (task.support, task.query)))
     drawn = Rotation(angle)
     expected = volume_of_all_views(model, Task(drawn.views(task.support), drawn.views(task.query))).float()
@@ -54,7 +54,7 @@ def test_a_rotated_volume_is_that_of_the_rotated_views(angle):
         assert colours < errors(wrong)[1]
 
 
-def test_as_many_episodes_are_rotated_as_asked_for():
+def test_the_given_share_of_episodes_is_rotated():
     angles = [draw_rotation(0.25, torch.Generator().manual_seed(seed)).angle for seed in range(800)]
     rotated = torch.tensor([angle for angle in angles if angle])
     assert len(rotated) == pytest.approx(200, abs=50)
@@ -63,7 +63,7 @@ def test_as_many_episodes_are_rotated_as_asked_for():
     assert draw_rotation(0.0, torch.Generator()) == Rotation()
 
 
-def test_a_training_shows_rotated_objects_with_their_volumes_and_goes_on_where_it_stopped(tmp_path):
+def test_a_training_uses_rotated_objects_with_their_volumes_and_can_be_resumed(tmp_path):
     config = replace(TRAINING, steps=2, rotations=1.0)
     plain, changed = (Trainer(HyperPlanes(MODEL), Balls(size=(24, 24)), each) for each in (TRAINING, config))
     name = changed.loader.names_of(0)[0]
@@ -84,7 +84,7 @@ def test_a_training_shows_rotated_objects_with_their_volumes_and_goes_on_where_i
 
 
 @pytest.mark.parametrize("share", [1.5, -0.1])
-def test_shares_that_are_none_and_trainings_without_episodes_are_refused(share):
+def test_invalid_shares_and_trainings_without_episodes_are_refused(share):
     with pytest.raises(ValueError, match="rotations: expected a share from 0 to 1"):
         replace(TRAINING, rotations=share)
     config = replace(TRAINING, views=(), volume_loss=0.0, rotations=0.5)

@@ -1,4 +1,4 @@
-"""Source of truth: the weights that a training is told to begin with."""
+"""Source of truth: the weights of the checkpoint that a training begins with."""
 
 import torch
 
@@ -9,8 +9,8 @@ from hyperplanes.training.start import start_training
 from tests.reference_rendering import Balls
 
 
-def test_a_training_by_its_preset_begins_with_the_packaged_weights(tmp_path):
-    """Without the gating network and the learned steps, which are trained after the model."""
+def test_a_training_with_its_preset_begins_with_the_packaged_weights(tmp_path):
+    """The gating network and the learned steps are left out, since they are trained after the model."""
     packaged, chosen = find_checkpoint("small"), preset("small")
     trainer = start_training(chosen.model, chosen.training, Balls(), tmp_path, reference=packaged)
     weights = HyperPlanes.from_pretrained(packaged).state_dict()
@@ -21,6 +21,6 @@ def test_a_training_by_its_preset_begins_with_the_packaged_weights(tmp_path):
     assert found.keys() <= weights.keys()
 
 
-def test_the_preset_of_the_packaged_model_uses_its_views_as_it_does():
+def test_the_preset_of_the_packaged_model_has_its_settings_of_views():
     model, packaged = preset("small").model, HyperPlanes.from_pretrained("small").config
     assert (model.stacked, model.symmetric) == (packaged.stacked, packaged.symmetric) == (True, True)

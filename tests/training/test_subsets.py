@@ -1,4 +1,4 @@
-"""Trainings on random numbers of random views. Source of truth: counts, and pictures whose truth is known."""
+"""Trainings on random numbers of random views. Source of truth: counts, and synthetic pictures."""
 
 from collections import Counter, defaultdict
 from dataclasses import replace
@@ -31,7 +31,7 @@ TRAINING = TrainingConfig(
 )  # fmt: skip
 
 
-def test_an_episode_shows_some_views_and_asks_for_others():
+def test_an_episode_has_separate_support_and_query_views():
     model, task = HyperPlanes(MODEL), Balls(views=6).task("train0")
     known, shown = torch.cat([centres(task.support.cameras), centres(task.query.cameras)]), Counter()
     for seed in range(60):
@@ -45,17 +45,17 @@ def test_an_episode_shows_some_views_and_asks_for_others():
     assert set(shown) == {1, 3, 5}
     assert min(shown.values()) > 10
     last = prepare_subset(model, task, (50,), torch.Generator().manual_seed(0))
-    assert (len(last.prepared.views), len(last.query)) == (11, 1)  # one is left to learn from
+    assert (len(last.prepared.views), len(last.query)) == (11, 1)  # one view is left as the query
 
 
-def test_every_object_comes_once_in_a_round_and_classes_come_in_turn():
+def test_every_object_is_drawn_once_per_round_and_classes_in_turn():
     classes = {"car": ["a", "b", "c"], "chair": ["d"]}
     drawn = [episode_object(classes, number, 0) for number in range(12)]
     assert drawn[1::2] == ["d"] * 6
     assert sorted(drawn[0:6:2]) == sorted(drawn[6:12:2]) == ["a", "b", "c"]
 
 
-def test_a_step_draws_of_the_episodes_at_hand_and_each_is_drawn_several_times():
+def test_a_step_draws_from_the_loaded_episodes_and_each_is_drawn_several_times():
     trainer = Trainer(HyperPlanes(MODEL), Balls(train=5), replace(TRAINING, tasks=3, episodes=6))
     numbers = Counter()
     for step in range(200):
@@ -63,10 +63,10 @@ def test_a_step_draws_of_the_episodes_at_hand_and_each_is_drawn_several_times():
         assert len(set(drawn)) == 3
         assert all(step <= number < step + 6 for number in drawn)
         numbers.update(drawn)
-    assert sum(numbers[number] for number in range(6, 200)) / 194 == pytest.approx(3, abs=0.1)  # as many as tasks
+    assert sum(numbers[number] for number in range(6, 200)) / 194 == pytest.approx(3, abs=0.1)  # the number of tasks
 
 
-def test_every_four_objects_of_a_step_draw_from_episodes_of_their_own():
+def test_each_four_objects_of_a_step_draw_from_separate_episodes():
     at_hand, steps, shares = 6, 50, defaultdict[int, set[int]](set)
     drawn_often = Counter[int]()
     for step in range(steps):
@@ -75,15 +75,15 @@ def test_every_four_objects_of_a_step_draw_from_episodes_of_their_own():
         drawn_often.update(drawn)
         for process in range(3):
             shares[process].update(Processes(process, 3).share(drawn))
-    assert [{number % 3 for number in shares[process]} for process in range(3)] == [{0}, {1}, {2}]  # none has another's
+    assert [{number % 3 for number in shares[process]} for process in range(3)] == [{0}, {1}, {2}]  # none is shared
     begun = [drawn_often[number] for number in range(3 * at_hand, 3 * steps)]
-    assert sum(begun) / len(begun) == pytest.approx(4, abs=0.1)  # as often as with four objects a step
+    assert sum(begun) / len(begun) == pytest.approx(4, abs=0.1)  # as with four objects per step
     assert draw_episodes(4, at_hand, 7, torch.Generator().manual_seed(7)) == [
         7 + place for place in torch.randperm(at_hand, generator=torch.Generator().manual_seed(7))[:4].tolist()
     ]
 
 
-def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):
+def test_a_resumed_training_is_equal_to_an_uninterrupted_one(tmp_path):
     whole = Trainer(HyperPlanes(MODEL), Balls(), TRAINING)
     list(whole.run())
     first = Trainer(HyperPlanes(MODEL), Balls(), TRAINING, tmp_path)
@@ -98,7 +98,7 @@ def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):
 
 
 class White(Balls):
-    """White balls over white: pictures of nothing, but for the masks."""
+    """White balls on a white background: only the masks show them."""
 
     def task(self, name):
         views = ball_views(ring(8))
@@ -107,7 +107,7 @@ class White(Balls):
 
 
 @pytest.mark.parametrize("random", [True, False])
-def test_only_random_backgrounds_tell_a_white_surface_from_none(random):
+def test_only_random_backgrounds_distinguish_a_white_surface_from_an_empty_field(random):
     model = HyperPlanes(replace(MODEL, hypernetwork=None))
     with torch.no_grad():
         model.networks["fine"].density.bias.fill_(-50.0)  # empty everywhere

@@ -1,5 +1,5 @@
-"""Sources of truth: the uninterrupted training that an interrupted one must equal to the bit, the steps of the
-optimisers by hand, and properties of what is drawn.
+"""Sources of truth: uninterrupted trainings, which resumed ones equal exactly, steps of the optimisers by hand, and
+properties of what is drawn.
 """
 
 import csv
@@ -89,11 +89,11 @@ def test_the_loss_falls(parts):
     ],
     ids=["hypernetwork", "target alone", "volumes", "volumes that are not rendered"],
 )
-def test_gradients_object_by_object_are_those_of_one_loss_of_all(make, training):
+def test_gradients_computed_per_object_are_those_of_one_loss_of_all_objects(make, training):
     config = with_(empty_points=50, **training)
 
     def begun():
-        torch.manual_seed(0)  # of what lets the hypernetwork say something
+        torch.manual_seed(0)  # awaken draws random numbers
         return Trainer(make(), Balls(), config)
 
     before, found = torch.get_num_threads(), []
@@ -106,7 +106,7 @@ def test_gradients_object_by_object_are_those_of_one_loss_of_all(make, training)
             found.append((loss, {name: value.grad for name, value in trainer.model.named_parameters()}))
     finally:
         torch.set_num_threads(before)
-    # the mean over the objects of the sums of their losses, backpropagated at once
+    # the mean over the objects of the sums of their losses, in one backward pass
     trainer = begun()
     model, batch = trainer.model.train(), trainer.loader.batch(0)
     updates = model.updates([each.episode.prepared for each in (*batch.rendered, *batch.reference)])
@@ -120,7 +120,7 @@ def test_gradients_object_by_object_are_those_of_one_loss_of_all(make, training)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_bfloat16_moves_updates_and_gradients_little_and_keeps_their_precision(threads):
+def test_bfloat16_changes_updates_and_gradients_little_and_keeps_their_dtype(threads):
     found, before = {}, torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -140,11 +140,11 @@ def test_bfloat16_moves_updates_and_gradients_little_and_keeps_their_precision(t
         assert 0 < (half - single).norm() < 0.03 * single.norm()
 
 
-def test_updates_of_other_precisions_keep_theirs_and_those_of_autocast_theirs():
+def test_the_dtypes_of_updates_without_mixed_precision_with_it_and_under_autocast():
     model = awaken(HyperPlanes(MODEL)).eval()
     context = model.prepare(Balls().task("train0").support)
     (single,), (half,) = ([u["fine.grid.weight"] for u in model.updates([context], mixed_precision=m)] for m in (0, 1))
-    with torch.autocast("cpu", torch.bfloat16):  # of the caller: it says what comes out
+    with torch.autocast("cpu", torch.bfloat16):  # the caller's autocast decides the dtype
         (own,) = model.updates([context])
     assert (single.dtype, half.dtype, own["fine.grid.weight"].dtype) == (*2 * (torch.float32,), torch.bfloat16)
     assert torch.equal(half, own["fine.grid.weight"].float())
@@ -160,7 +160,7 @@ def test_updates_of_other_precisions_keep_theirs_and_those_of_autocast_theirs():
         ("bfloat16", False, False, "bfloat16"),
     ],
 )
-def test_bfloat16_is_taken_where_it_is_fast_and_exact_enough_or_asked_for(
+def test_bfloat16_is_used_where_it_is_fast_and_exact_enough_or_requested(
     monkeypatch, precision, fast, volumes, expected
 ):
     monkeypatch.setattr(checkpointing, "has_fast_bfloat16", lambda: fast)
@@ -174,7 +174,7 @@ def test_bfloat16_is_taken_where_it_is_fast_and_exact_enough_or_asked_for(
 
 @pytest.mark.parametrize("begun", ["single", "bfloat16"])
 def test_a_resumed_training_keeps_its_precision(monkeypatch, tmp_path, begun):
-    """Whatever the processor that it goes on with would choose."""
+    """The precision does not depend on the processor that resumes the training."""
     Trainer(awaken(HyperPlanes(MODEL)), Balls(), with_(precision=begun), tmp_path).save()
     for fast in (True, False):
         monkeypatch.setattr(checkpointing, "has_fast_bfloat16", lambda fast=fast: fast)
@@ -199,7 +199,7 @@ def test_an_unknown_precision_is_refused_in_code_and_in_settings():
 
 
 @pytest.mark.parametrize("safe", [True, False])
-def test_objects_have_threads_of_their_own_where_the_field_is_thread_safe(safe, monkeypatch):
+def test_objects_have_separate_threads_if_the_field_is_thread_safe(safe, monkeypatch):
     trainer, callers = Trainer(small_model(hypernetwork=None), Balls(), with_(rays=1)), set()
 
     def noting(*given):
@@ -231,12 +231,10 @@ def test_objects_have_threads_of_their_own_where_the_field_is_thread_safe(safe, 
         (False, 2, 4, [4]),
     ],
 )
-def test_objects_that_are_read_alone_go_through_the_hypernetwork_in_groups_of_two_at_least(
-    volumes, threads, tasks, expected
-):
+def test_independent_objects_pass_the_hypernetwork_in_groups_of_at_least_two(volumes, threads, tasks, expected):
     model, sizes = HyperPlanes(MODEL) if volumes else small_model(), []
     trainer = Trainer(model, Balls(), with_(tasks=tasks, rays=1))
-    model.updates = lambda objects, **named: sizes.append(len(objects)) or [Parameters()] * len(objects)  # none
+    model.updates = lambda objects, **named: sizes.append(len(objects)) or [Parameters()] * len(objects)  # no updates
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(threads)
@@ -246,7 +244,7 @@ def test_objects_that_are_read_alone_go_through_the_hypernetwork_in_groups_of_tw
     assert sorted(sizes, reverse=True) == expected
 
 
-def test_the_same_seed_makes_the_same_curve_and_the_same_weights():
+def test_the_same_seed_gives_the_same_curve_and_weights():
     first, second, third = small_model(), small_model(), small_model()
     curve = losses(first, FAST, 2)
     before = torch.random.get_rng_state()
@@ -256,7 +254,7 @@ def test_the_same_seed_makes_the_same_curve_and_the_same_weights():
     assert losses(third, with_(seed=1), 2) != curve
 
 
-def test_every_step_draws_anew():
+def test_every_step_draws_other_rays():
     still = with_(learning_rate=0.0, hypernetwork_learning_rate=0.0)
     assert len(set(losses(small_model(), still, 3))) == 3
 
@@ -282,7 +280,7 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, 
     for _ in range(2):
         first.take_step()
     first.save()
-    first.take_step()  # lost: the training was stopped before the next checkpoint
+    first.take_step()  # lost, since no checkpoint follows
     resumed = Trainer(small_model(hypernetwork=shape), Balls(), config, tmp_path / "parts")
     assert resumed.step == 2
     list(resumed.run())
@@ -296,12 +294,12 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, 
 
 
 @pytest.mark.parametrize("reference_objects", [0, 3])
-def test_reference_objects_take_what_objects_share_out_of_the_gradient_of_their_codes(reference_objects):
-    # Property: batch normalisation over the objects of a step has a gradient that sums to zero over them.
+def test_reference_objects_remove_the_mean_of_the_gradients_of_codes(reference_objects):
+    # Property: with batch normalisation over the objects of a step, the gradient sums to zero over the objects.
     shape = ImageHyperNetworkConfig(views=2, code=8, depth=2, width=16, normalisation="group", **ALL_LAYERS)
     model = awaken(small_model(hypernetwork=shape))
     trainer = Trainer(model, Balls(), with_(tasks=1, reference_objects=reference_objects))
-    trainer.take_step()  # the running statistics are those of a step before
+    trainer.take_step()  # sets the running statistics
     gradients = []
     model.hypernetwork.code_normalisation.register_full_backward_hook(lambda _, given, __: gradients.append(given[0]))
     trainer.take_step()
@@ -328,13 +326,13 @@ def test_a_finished_training_is_not_repeated(tmp_path):
     assert same(again.model.state_dict(), weights)
 
 
-def test_a_training_with_other_options_is_not_resumed(trained):
+def test_a_training_with_other_settings_is_not_resumed(trained):
     with pytest.raises(CheckpointError) as caught:
         Trainer(small_model(), Balls(), with_(steps=1, rays=64, seed=3), trained)
     message = str(caught.value)
     assert "\n" not in message
     assert all(word in message for word in ("training.json", "expected the same training", "rays", "seed", "--out"))
-    Trainer(small_model(), Balls(), with_(steps=9), trained)  # more steps of the same training are fine
+    Trainer(small_model(), Balls(), with_(steps=9), trained)  # more steps of the same training are allowed
 
 
 def test_a_checkpoint_of_another_model_is_not_resumed(trained):
@@ -344,7 +342,7 @@ def test_a_checkpoint_of_another_model_is_not_resumed(trained):
         Trainer(small_model(hypernetwork=None), Balls(), with_(steps=1), trained)
 
 
-def test_theta_and_the_hypernetwork_have_optimisers_of_their_own():
+def test_theta_and_the_hypernetwork_have_separate_optimisers():
     model = small_model()
     trainer = Trainer(model, Balls(), with_(learning_rate=3e-3, hypernetwork_learning_rate=1e-4))
     groups = [
@@ -356,7 +354,7 @@ def test_theta_and_the_hypernetwork_have_optimisers_of_their_own():
 
 
 @pytest.mark.parametrize("frozen", ["theta", "hypernetwork"])
-def test_a_rate_of_zero_freezes_its_part_alone(frozen):
+def test_a_rate_of_zero_freezes_only_its_part(frozen):
     rates = {"learning_rate": 1e-2, "hypernetwork_learning_rate": 1e-2}
     rates["learning_rate" if frozen == "theta" else "hypernetwork_learning_rate"] = 0.0
     model = small_model()
@@ -366,7 +364,7 @@ def test_a_rate_of_zero_freezes_its_part_alone(frozen):
     assert moved == ({"hypernetwork"} if frozen == "theta" else {"networks"})
 
 
-def test_a_pixel_of_a_training_is_the_mean_of_three_rays_where_it_says_so(monkeypatch):
+def test_with_antialias_each_pixel_of_a_training_has_three_rays(monkeypatch):
     counts = []
     trace = base.AdaptedField.trace
     monkeypatch.setattr(
@@ -380,7 +378,7 @@ def test_a_pixel_of_a_training_is_the_mean_of_three_rays_where_it_says_so(monkey
         assert set(counts) == {times * FAST.rays}
 
 
-def test_muon_moves_the_hidden_matrices_by_its_own_rate():
+def test_muon_changes_the_hidden_matrices_at_its_own_rate():
     model = small_model()
     before = state_of(model)
     config = with_(optimiser="muon", learning_rate=0.0, hypernetwork_learning_rate=0.0, muon_learning_rate=0.01)
@@ -389,13 +387,13 @@ def test_muon_moves_the_hidden_matrices_by_its_own_rate():
     assert moved == {f"networks.fine.{name}.weight" for name in ("layers.0", "layers.1", "feature")}
 
 
-def test_without_a_hypernetwork_theta_alone_is_trained():
+def test_without_a_hypernetwork_only_theta_is_trained():
     trainer = Trainer(small_model(hypernetwork=None), Balls(), FAST)
     assert len(trainer.optimisation.optimisers) == 1
 
 
 def test_rates_rise_in_the_warm_up_and_fall_along_half_a_cosine():
-    # 2 steps of warm-up: 1/2, 1; then half a cosine over 4 steps from 1 towards 0.2: at 0, 1/4, 1/2, 3/4 of it
+    # 2 steps of warm-up have 1/2 and 1; then half a cosine over 4 steps goes from 1 to 0.2, at 0, 1/4, 1/2 and 3/4
     config = with_(steps=6, rays=1, warmup=2, final_rate_factor=0.2, learning_rate=1.0)
     trainer = Trainer(small_model(hypernetwork=None), Balls(), config)
     rates = []
@@ -407,22 +405,22 @@ def test_rates_rise_in_the_warm_up_and_fall_along_half_a_cosine():
     assert rates == pytest.approx(expected)
 
 
-def test_the_paper_keeps_its_rate():
+def test_the_rate_is_constant_by_default_as_in_the_paper():
     trainer = Trainer(small_model(), Balls(), with_(steps=3))
     for _ in range(3):
         trainer.take_step()
         assert trainer.optimisation.optimisers[0].param_groups[0]["lr"] == 1e-3
 
 
-def test_several_objects_a_step_are_averaged():
+def test_the_gradients_of_several_objects_of_a_step_are_averaged():
     found = []
-    for tasks in (1, 3):  # one object: three draws of it differ in their rays alone
+    for tasks in (1, 3):  # draws of the only object differ in their rays only
         trainer = Trainer(small_model(hypernetwork=None), Balls(train=1), with_(tasks=tasks, rays=4096))
         found.append((trainer.take_step(), trainer.norms()["gradient_theta"]))
     assert found[1] == pytest.approx(found[0], rel=0.1)
 
 
-def test_objects_that_fall_out_of_memory_change_nothing():
+def test_objects_that_are_evicted_from_memory_change_nothing():
     assert losses(small_model(), with_(memory=1), 3) == losses(small_model(), FAST, 3)
 
 
@@ -452,7 +450,7 @@ def test_progress_is_reported_with_the_held_out_quality(tmp_path):
     assert json.loads((tmp_path / "training.json").read_text())["curve"] == trainer.curve
 
 
-def test_no_held_out_objects_have_no_quality():
+def test_without_held_out_objects_there_is_no_quality():
     assert Trainer(small_model(), Balls(test=0), FAST).validate() is None
 
 
@@ -462,12 +460,12 @@ def test_no_training_object_is_refused():
 
 
 class Killed(BaseException):
-    """The process ends here."""
+    """Stands for the end of the process."""
 
 
 @pytest.mark.parametrize("memory", [1, 2**30], ids=["nothing kept", "all kept"])
-def test_objects_made_ready_by_a_thread_change_nothing(memory):
-    """The same curve to the bit, and every object that is not kept is made in the thread."""
+def test_preparing_objects_in_a_thread_changes_nothing(memory):
+    """The curve is exactly the same, and every object that is not cached is prepared in the thread."""
     threads, runs = set(), []
     for prefetch in (0, 2):
         data = Balls(train=5)
@@ -482,7 +480,7 @@ def test_objects_made_ready_by_a_thread_change_nothing(memory):
         assert same(weights, runs[0][1])
 
 
-def test_an_object_that_the_thread_cannot_read_ends_the_step_that_needs_it():
+def test_an_error_of_the_thread_is_raised_in_the_step_that_needs_the_object():
     data = Balls(train=1)
     task = data.task
     trainer = Trainer(small_model(), data, with_(steps=3, memory=1))
@@ -492,8 +490,8 @@ def test_an_object_that_the_thread_cannot_read_ends_the_step_that_needs_it():
     assert trainer.step == 0
 
 
-def test_epochs_are_steps_in_which_every_object_is_drawn_so_often():
-    # 5 objects, 2 a step, 4 epochs: 20 draws, 10 steps
+def test_the_number_of_epochs_is_how_often_each_object_is_drawn():
+    # 5 objects, 2 per step, for 4 epochs are 20 draws in 10 steps
     assert Trainer(small_model(), Balls(train=5), with_(epochs=4, tasks=2)).config.steps == 10
     assert Trainer(small_model(), Balls(train=5), with_(epochs=1, tasks=2)).config.steps == 3
     assert train(small_model(), Balls(train=2), with_(epochs=2, tasks=2, rays=4)).step == 2
@@ -514,14 +512,14 @@ def test_norms_are_those_of_gradients_and_updates():
     assert found["update"] > 0.1
 
 
-def test_a_curve_and_pictures_lie_beside_the_weights(tmp_path):
+def test_a_curve_and_pictures_are_saved_with_the_weights(tmp_path):
     trainer = train(small_model(), Balls(test=2), with_(steps=1), tmp_path)
     with (tmp_path / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [{name: float(value) for name, value in row.items()} for row in rows] == trainer.curve
     assert {"step", "loss", "psnr", "ssim", "spread", "swap_gap", "gradient_theta", "update"} <= set(rows[0])
     assert sorted(path.name for path in (tmp_path / "samples").iterdir()) == ["00000001.png"]
-    with Image.open(tmp_path / "samples" / "00000001.png") as sheet:  # two views of two objects, beside the truth
+    with Image.open(tmp_path / "samples" / "00000001.png") as sheet:  # two views of two objects, next to the truth
         pixels = np.asarray(sheet)
     assert pixels.shape == (4 * 16, 2 * 16, 3)
     for index, (name, view) in enumerate((name, view) for name in ("test0", "test1") for view in (0, 2)):
@@ -543,7 +541,7 @@ def test_a_resumed_training_writes_its_curve_in_the_same_columns(tmp_path):
 
 
 def test_tensorboard_shows_the_curve_and_the_pictures(tmp_path):
-    """Source of truth: TensorBoard's own reader of event files."""
+    """Source of truth: TensorBoard's reader of event files."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     trainer = Trainer(small_model(), Balls(test=2), with_(steps=2, evaluate_every=1))
@@ -558,8 +556,8 @@ def test_tensorboard_shows_the_curve_and_the_pictures(tmp_path):
     assert [event.step for event in found.Images(found.Tags()["images"][0])] == [1, 2]
 
 
-def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, monkeypatch):
-    """Killed before each write of the second checkpoint in turn: the first or the second is there, never a mixture."""
+def test_a_training_that_is_killed_while_it_saves_has_one_complete_state(tmp_path, monkeypatch):
+    """Killed before any write of the second checkpoint, it leaves the first or the second, and never a mixture."""
     trainer = Trainer(small_model(), Balls(), FAST, tmp_path)
     states = {}
     for step in (1, 2):
@@ -594,7 +592,7 @@ def test_a_training_that_is_killed_while_it_saves_has_one_whole_state(tmp_path, 
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
-def test_checkpoints_are_written_when_they_are_due_and_not_only_with_a_report(tmp_path, monkeypatch):
+def test_checkpoints_are_written_at_their_interval_and_not_only_with_a_report(tmp_path, monkeypatch):
     saved = []
     config = with_(steps=30, tasks=1, rays=1, checkpoint_every=7)
     trainer = Trainer(small_model(hypernetwork=None), Balls(test=0), config, tmp_path)
@@ -614,14 +612,14 @@ def test_checkpoints_are_written_when_they_are_due_and_not_only_with_a_report(tm
         ({"hypernetwork": replace(small_model().config.hypernetwork, rank=5)}, "hypernetwork.rank"),
     ],
 )
-def test_a_model_that_differs_in_no_weight_is_another_all_the_same(trained, change, name):
+def test_a_model_with_other_settings_but_the_same_weights_is_another(trained, change, name):
     with pytest.raises(CheckpointError, match=f"model.json: .*found other .*{name}.*; give another --out"):
         Trainer(small_model(**change), Balls(), with_(steps=1), trained)
 
 
 @pytest.mark.parametrize("name", ["step", "curve", "config", "data", "state"])
 @pytest.mark.parametrize("value", [None, "missing", "../../elsewhere"])
-def test_a_training_file_with_a_hole_is_a_checkpoint_error(trained, name, value):
+def test_a_training_file_without_a_value_is_a_checkpoint_error(trained, name, value):
     saved = json.loads((trained / "training.json").read_text())
     saved = (
         {key: entry for key, entry in saved.items() if key != name} if value == "missing" else {**saved, name: value}
@@ -633,7 +631,7 @@ def test_a_training_file_with_a_hole_is_a_checkpoint_error(trained, name, value)
 
 
 @pytest.mark.parametrize("row", [1, {"loss": 0.5}, {"step": 1, "psnr": "high"}], ids=str)
-def test_a_curve_that_is_none_is_a_checkpoint_error(trained, row):
+def test_an_invalid_curve_is_a_checkpoint_error(trained, row):
     saved = json.loads((trained / "training.json").read_text())
     (trained / "training.json").write_text(json.dumps({**saved, "curve": [*saved["curve"], row]}))
     with pytest.raises(CheckpointError, match=r"training.json: expected a curve of numbers by name, .* found "):
@@ -653,8 +651,8 @@ def test_memory_is_bounded_in_bytes():
     whole = Trainer(small_model(), Balls(), FAST)
     whole.loader.get("train0")
     one = whole.loader.cache.nbytes
-    # 4 support and 4 query views of 16 x 16 pixels, 4 floats each, a third of the colours again for lookups, a hull
-    # of 16^3 bytes, and 8 bytes a pixel that sees it
+    # 4 support and 4 query views of 16 x 16 pixels with 4 floats each, the colours of the support views once more for
+    # lookups with 4 bytes per pixel, a hull of 16^3 bytes, and 8 bytes for each pixel that shows the hull
     least = 8 * 16 * 16 * 4 * 4 + 4 * 16 * 16 * 4 + 16**3
     assert least < one <= least + 4 * 16 * 16 * 8
     tight = Trainer(small_model(), Balls(), with_(memory=int(2.5 * one)))
@@ -666,7 +664,7 @@ def test_memory_is_bounded_in_bytes():
     assert tight.loader.cache.get("train1") is not None
 
 
-def test_the_papers_protocol_carves_no_hull_unless_empty_space_is_asked_for(monkeypatch):
+def test_the_protocol_of_the_paper_carves_no_hull_unless_empty_space_is_skipped(monkeypatch):
     carved = []
     monkeypatch.setattr(base, "carve", lambda *given, **more: carved.append(given) or occupancy.carve(*given, **more))
     dense = {"coarse_network": True, "sampling": Hierarchical(4, 4)}
@@ -678,7 +676,7 @@ def test_the_papers_protocol_carves_no_hull_unless_empty_space_is_asked_for(monk
     assert carved
 
 
-def test_held_out_objects_are_of_the_validation_split_where_there_is_one():
+def test_held_out_objects_come_from_the_validation_split_if_there_is_one():
     data, asked = Balls(test=2), []
     task = data.task
     data.task = lambda name: asked.append(name) or task(name)
@@ -687,10 +685,10 @@ def test_held_out_objects_are_of_the_validation_split_where_there_is_one():
     asked.clear()
     first = trainer.validate().psnr
     assert trainer.validate().psnr == first
-    assert asked == ["test1"]  # and its planes and hull are kept between validations
+    assert asked == ["test1"]  # its planes and hull are kept between validations
 
 
-def test_a_validation_is_adapting_and_rendering():
+def test_a_validation_is_the_quality_of_adapted_and_rendered_objects():
     data = Balls()
     trainer = Trainer(small_model(), data, FAST)
     trainer.take_step()
@@ -711,7 +709,7 @@ def test_an_object_that_cannot_be_trained_on_is_named():
         Trainer(small_model(), Blank(), FAST).take_step()
 
 
-def test_a_held_out_object_that_cannot_be_validated_on_is_named_before_the_first_step():
+def test_an_unusable_held_out_object_is_named_before_the_first_step():
     class Blank(Balls):
         def task(self, name):
             task = super().task(name)
@@ -724,8 +722,8 @@ def test_a_held_out_object_that_cannot_be_validated_on_is_named_before_the_first
     assert trainer.step == 0
 
 
-def test_a_validation_tells_what_the_updates_have_in_common(tmp_path):
-    """Diagnostics of the held-out objects, recorded in the curve and beside the weights."""
+def test_a_validation_reports_the_common_part_of_the_updates(tmp_path):
+    """The diagnostics of the held-out objects are saved in the curve and with the weights."""
     model = awaken(small_model())
     trainer = Trainer(model, Balls(test=3), with_(steps=2, evaluate_every=2), tmp_path)
     (progress,) = list(trainer.run())
@@ -746,7 +744,7 @@ def test_training_warns_once_when_every_object_gets_the_same_update(capsys):
     assert capsys.readouterr().err.count("the hypernetwork predicts the same update for every object") == 1
 
 
-def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stays(tmp_path):
+def test_training_ends_at_a_loss_that_is_not_finite_and_keeps_the_last_checkpoint(tmp_path):
     class Poisoned(Balls):
         broken = False
 
@@ -755,7 +753,7 @@ def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stay
             if not self.broken:
                 return task
             query = replace(task.query, images=task.query.images.clone())
-            query.images.fill_(float("nan"))  # past the check of Views
+            query.images.fill_(float("nan"))  # after the checks of Views
             return replace(task, query=query)
 
     data = Poisoned(test=0)
@@ -773,7 +771,7 @@ def test_training_ends_where_the_loss_is_not_finite_and_the_last_checkpoint_stay
 
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, Terminated), (signal.SIGHUP, HungUp)])
 def test_a_signal_ends_a_training_after_its_step_with_a_checkpoint(tmp_path, number, error):
-    """SIGHUP is what a terminal sends that is closed, to the shell and by the shell: more than once."""
+    """When a terminal is closed, SIGHUP comes from the terminal and from the shell, so more than once."""
 
     class Signalled(Trainer):
         def take_step(self):
@@ -792,7 +790,7 @@ def test_a_signal_ends_a_training_after_its_step_with_a_checkpoint(tmp_path, num
     assert signal.getsignal(number) is before
 
 
-def test_a_training_under_nohup_goes_on_when_its_terminal_is_closed(tmp_path):
+def test_a_training_under_nohup_continues_when_its_terminal_is_closed(tmp_path):
     class Signalled(Trainer):
         def take_step(self):
             signal.raise_signal(signal.SIGHUP)
@@ -807,8 +805,8 @@ def test_a_training_under_nohup_goes_on_when_its_terminal_is_closed(tmp_path):
     assert json.loads((tmp_path / "training.json").read_text())["step"] == 2
 
 
-def test_a_training_does_not_go_on_with_other_data(tmp_path):
-    """By hand: another object more, and the same names with other pictures."""
+def test_a_training_is_not_resumed_with_other_data(tmp_path):
+    """One more object, and other pictures with the same names."""
     Trainer(small_model(), Balls(test=0), with_(steps=2), tmp_path).save()
 
     class Darker(Balls):
@@ -817,7 +815,7 @@ def test_a_training_does_not_go_on_with_other_data(tmp_path):
             return replace(task, support=replace(task.support, images=task.support.images / 2))
 
     class Shifted(Balls):
-        """As --legacy reads them: the same pictures with the principal point half a pixel further."""
+        """As --legacy reads them, with the principal point moved by half a pixel."""
 
         def task(self, name):
             task = super().task(name)
@@ -834,7 +832,7 @@ def test_a_training_does_not_go_on_with_other_data(tmp_path):
             Trainer(small_model(), data, with_(steps=2), tmp_path)
 
 
-def test_weights_whose_training_json_is_lost_are_not_trained_over(tmp_path):
+def test_weights_without_their_training_json_are_not_overwritten(tmp_path):
     trainer = Trainer(small_model(), Balls(test=0), with_(steps=2, keep_last=2), tmp_path)
     trainer.take_step()
     trainer.save()
@@ -847,7 +845,7 @@ def test_weights_whose_training_json_is_lost_are_not_trained_over(tmp_path):
     assert Trainer(small_model(), Balls(test=0), with_(steps=2, keep_last=2), tmp_path).step == 1
 
 
-def test_a_first_checkpoint_that_was_killed_before_its_model_is_made_whole(tmp_path):
+def test_a_first_checkpoint_without_its_model_is_completed(tmp_path):
     trainer = Trainer(small_model(), Balls(test=0), with_(steps=2), tmp_path)
     trainer.take_step()
     trainer.save()
@@ -880,7 +878,7 @@ def test_views_in_double_precision_are_trained_on_as_in_single(tmp_path):
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)
 
 
-def test_a_validation_of_the_step_that_a_training_stops_at_is_reported():
+def test_the_validation_at_the_last_step_of_a_stopped_training_is_reported():
     trainer = Trainer(small_model(), Balls(), with_(steps=6, evaluate_every=2))
     trainer.stopping = True
     trainer.take_step()

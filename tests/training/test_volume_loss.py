@@ -1,4 +1,4 @@
-"""The loss of volumes. Source of truth: grids that are right by construction, and what a step must not touch."""
+"""The volume loss. Source of truth: grids that are correct by construction, and weights that a step must not change."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -41,7 +41,7 @@ def weights(grid):
     return Parameters({"fine.grid.weight": grid})
 
 
-def test_the_true_hull_and_colours_have_the_least_loss():
+def test_the_true_hull_and_colours_have_the_smallest_loss():
     model = HyperPlanes(MODEL)
     shown = episode(model)
     whole = shown.target_volume.float()
@@ -59,11 +59,11 @@ def test_an_object_whose_volume_cannot_be_made_is_named():
         volume_of_all_views(HyperPlanes(MODEL), replace(blank, query=blank.support))
 
 
-def test_only_cells_of_the_hull_that_is_shown_count_and_only_the_first_features():
+def test_only_cells_in_the_hull_of_the_shown_views_and_the_first_features_count():
     model = HyperPlanes(MODEL)
     shown = episode(model)
     left = shown.prepared.volume[0] > 0
-    assert bool((left & (shown.target_volume[0] == 0)).any())  # few views leave more than all do
+    assert bool((left & (shown.target_volume[0] == 0)).any())  # the hull of few views is larger
     grid = torch.zeros(5, *left.shape, requires_grad=True)
     volume_loss(weights(grid), shown).backward()
     assert bool((grid.grad[0, left] != 0).all())
@@ -71,7 +71,7 @@ def test_only_cells_of_the_hull_that_is_shown_count_and_only_the_first_features(
     assert not grid.grad[4:].any()
 
 
-def test_a_training_learns_what_is_behind_the_views_that_are_shown():
+def test_a_training_learns_parts_that_the_shown_views_do_not_show():
     model = HyperPlanes(MODEL)
     trainer = Trainer(model, Balls(views=8, size=(24, 24)), replace(TRAINING, steps=12, volume_loss=1.0))
     shown = episode(model)
@@ -86,7 +86,7 @@ def test_a_training_learns_what_is_behind_the_views_that_are_shown():
     assert loss() < 0.7 * before
 
 
-def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):
+def test_a_resumed_training_is_equal_to_an_uninterrupted_one(tmp_path):
     config = replace(TRAINING, steps=2)
     whole = Trainer(HyperPlanes(MODEL), Balls(), config)
     list(whole.run())
@@ -108,6 +108,6 @@ def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path):
         ({}, replace(TRAINING, views=())),
     ],
 )
-def test_models_and_trainings_without_what_it_needs_are_refused(changes, training):
+def test_models_and_trainings_that_do_not_support_the_loss_are_refused(changes, training):
     with pytest.raises(ValueError, match=r"training\.volume_loss: expected .*, got views "):
         Trainer(HyperPlanes(replace(MODEL, **changes)), Balls(), training)

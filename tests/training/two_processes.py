@@ -1,7 +1,7 @@
-"""What two processes do in `test_distributed.py`: `python -m tests.training.two_processes FOLDER`.
+"""The two processes of `test_distributed.py`: `python -m tests.training.two_processes FOLDER`.
 
-It is `hyperplanes train --devices 2`, with other trainings before the one that was asked for: where the command would
-begin to train, its processes have joined. In the end the second process is killed.
+The module runs `hyperplanes train --devices 2`. Where the command would begin to train, its processes have joined, and
+other trainings run first. At the end the second process is killed.
 """
 
 import os
@@ -40,26 +40,26 @@ class Precise(Balls):
 
 
 class Data(Balls):
-    """Objects that the command line takes for a data set."""
+    """Objects that the command line accepts as a data set."""
 
     skipped = ()
 
 
 def conditioned(folder=None):
-    """Standardised codes and outputs, reference objects, Muon."""
+    """A training with standardised codes and outputs, reference objects and Muon."""
     model = awaken(small_model(hypernetwork=ImageHyperNetworkConfig(**SHAPE, normalisation="group"))).double()
     return Trainer(model, Precise(6), replace(CONFIG, reference_objects=2, optimiser="muon", steps=3), folder)
 
 
 def normalised(folder=None):
-    """Batch normalisation, a gradient that is clipped."""
+    """A training with batch normalisation and clipped gradients."""
     model = awaken(small_model(hypernetwork=ImageHyperNetworkConfig(**SHAPE, normalisation="batch"))).double()
     config = replace(CONFIG, tasks=2, clip=0.02)
     return Trainer(model, Precise(3), config, folder)
 
 
 def initialised(folder=None):
-    """Reptile, whose gradient no backward pass makes."""
+    """A training with Reptile, whose gradient does not come from a backward pass."""
     start = InitialisationConfig("mv_meta", inner_steps=2)
     model = small_model(hypernetwork=None, target="nerf", initialisation=start).double()
     return initialisation_trainer(model, Precise(3), replace(CONFIG, tasks=2, steps=2), folder)
@@ -76,12 +76,12 @@ OPTIONS = """
 
 
 class Poisoned(Balls):
-    """The second half of a step has no colours."""
+    """Objects whose query views have colours that are NaN. The second process trains on them."""
 
     def task(self, name):
         task = super().task(name)
         query = replace(task.query, images=task.query.images.clone())
-        query.images.fill_(float("nan"))  # past the check of Views
+        query.images.fill_(float("nan"))  # after the checks of Views
         return replace(task, query=query)
 
 
@@ -91,7 +91,7 @@ def weights_of(trainer):
 
 
 def end_of(call):
-    """The error that a call ends in, as text."""
+    """The error that a call raises, as text."""
     try:
         call()
     except (ValueError, KeyboardInterrupt) as error:
@@ -100,10 +100,10 @@ def end_of(call):
 
 
 def run_all(folder, rank):
-    """Every training of this module; what comes of it is in the folder, a file a process."""
+    """Run every training of this module, and save one file of results per process in the folder."""
     told = {}
     for name, kind in KINDS.items():
-        trainer = kind(folder / name)  # of one of them there is a checkpoint of a single process
+        trainer = kind(folder / name)  # one of them has a checkpoint of a single process
         list(trainer.run())
         save_tensors(folder / f"{name}-{rank}.safetensors", weights_of(trainer))
         told[name] = trainer.curve[-1]

@@ -1,4 +1,4 @@
-"""Source of truth: wrong calls of people who come from NumPy and other libraries; each is a line with the name."""
+"""Source of truth: typical wrong calls; each gives one line that names the argument."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def test_arguments_of_another_type_are_named(call, message):
         call()
 
 
-def test_sizes_that_an_annotation_names_are_looked_at_wherever_others_are_left_open():
+def test_sizes_in_an_annotation_are_checked_with_any_batch_dimensions():
     @checked
     def taken(rows: Float[Tensor, "*batch 4 3"]):
         return rows.shape
@@ -79,7 +79,7 @@ def test_sizes_that_an_annotation_names_are_looked_at_wherever_others_are_left_o
             taken(torch.zeros(shape))
 
 
-def test_right_arguments_pass():
+def test_correct_arguments_are_accepted():
     @checked
     def scaled(value: float, times: int = 1, name: str | None = None):
         return value * times
@@ -90,7 +90,7 @@ def test_right_arguments_pass():
         scaled(1.0, True)
 
 
-def test_elements_of_tuples_are_looked_at():
+def test_elements_of_tuples_are_checked():
     @checked
     def drawn(sizes: tuple[int, ...], names: tuple[tuple[str, float], ...] = ()):
         return len(sizes)

@@ -1,4 +1,4 @@
-"""Sources of truth: what was written, and files damaged on purpose."""
+"""Sources of truth: the written values, and files that are damaged here."""
 
 import errno
 import io
@@ -28,8 +28,8 @@ def weights(tmp_path):
     return path
 
 
-def complaint(path, call):
-    """The message of the error: one line, about this file."""
+def error_line(path, call):
+    """The message of the error, which must be one line that starts with the file."""
     with pytest.raises(DataError) as caught:
         call()
     message = str(caught.value)
@@ -40,7 +40,7 @@ def complaint(path, call):
     return message
 
 
-def test_tensors_come_back_as_they_were(weights):
+def test_tensors_are_read_back_unchanged(weights):
     found = load_tensors(weights, TENSORS)
     assert set(found) == set(TENSORS)
     for name, value in TENSORS.items():
@@ -49,7 +49,7 @@ def test_tensors_come_back_as_they_were(weights):
     assert os.listdir(weights.parent) == [weights.name]
 
 
-def test_json_comes_back_as_it_was(tmp_path):
+def test_json_is_read_back_unchanged(tmp_path):
     value = {"steps": 3, "nested": {"layers": ["colour", "density"]}, "none": None}
     write_json(tmp_path / "deep" / "model.json", value)
     assert read_json(tmp_path / "deep" / "model.json") == value
@@ -58,14 +58,14 @@ def test_json_comes_back_as_it_was(tmp_path):
 def test_a_missing_file_names_the_command_that_makes_one(tmp_path):
     for name, call in (("x.safetensors", load_tensors), ("x.json", read_json)):
         path = tmp_path / name
-        assert "`hyperplanes train` writes" in complaint(path, lambda call=call, path=path: call(path))
+        assert "`hyperplanes train` writes" in error_line(path, lambda call=call, path=path: call(path))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.99])
-def test_a_truncated_file_is_damaged(weights, share):
+def test_a_truncated_file_is_refused(weights, share):
     content = weights.read_bytes()
     weights.write_bytes(content[: int(len(content) * share)])
-    assert "copy it again" in complaint(weights, lambda: load_tensors(weights))
+    assert "copy it again" in error_line(weights, lambda: load_tensors(weights))
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_a_truncated_file_is_damaged(weights, share):
 )
 def test_weights_of_another_architecture(weights, change, words):
     expected = {name: value for name, value in {**TENSORS, **change}.items() if value is not None}
-    message = complaint(weights, lambda: load_tensors(weights, expected))
+    message = error_line(weights, lambda: load_tensors(weights, expected))
     assert words in message
     assert "the configuration is of another model" in message
 
@@ -86,19 +86,19 @@ def test_weights_of_another_architecture(weights, change, words):
 @pytest.mark.parametrize(
     "content", [b"", b"{", b"\xff\xfe\x00", b"[1, 2]", b"nonsense", b"[" * 100_000], ids=lambda c: repr(c[:8])
 )
-def test_garbage_instead_of_json(tmp_path, content):
+def test_invalid_json_is_refused(tmp_path, content):
     path = tmp_path / "model.json"
     path.write_bytes(content)
-    complaint(path, lambda: read_json(path))
+    error_line(path, lambda: read_json(path))
 
 
-def test_folders_are_no_files(tmp_path):
-    complaint(tmp_path, lambda: read_json(tmp_path))
-    complaint(tmp_path, lambda: load_tensors(tmp_path))
+def test_folders_are_refused_as_files(tmp_path):
+    error_line(tmp_path, lambda: read_json(tmp_path))
+    error_line(tmp_path, lambda: load_tensors(tmp_path))
 
 
 class Poison:
-    """Unpickling this leaves a file behind."""
+    """Unpickling this creates a file."""
 
     def __init__(self, trace):
         self.trace = trace
@@ -111,15 +111,15 @@ class Poison:
 def test_a_pickle_is_refused_and_never_run(tmp_path, legacy):
     path, trace = tmp_path / "model.safetensors", tmp_path / "trace"
     torch.save({"a": Poison(trace)}, path, _use_new_zipfile_serialization=not legacy)
-    complaint(path, lambda: load_tensors(path))
+    error_line(path, lambda: load_tensors(path))
     assert not trace.exists()
     torch.load(io.BytesIO(path.read_bytes()), weights_only=False)
-    assert trace.exists()  # it would have
+    assert trace.exists()  # unpickling it creates the file
 
 
 @pytest.fixture
 def full_disk(monkeypatch):
-    """A disk that is full when the content is to be made durable."""
+    """A disk that is full when `fsync` is called."""
 
     def fail(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -150,13 +150,13 @@ def test_a_rename_that_fails_leaves_no_partial_file(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == []
 
 
-def test_what_cannot_be_written_as_json_leaves_nothing(tmp_path):
+def test_values_that_json_cannot_represent_leave_no_file(tmp_path):
     with pytest.raises(TypeError):
         write_json(tmp_path / "model.json", {"tensor": torch.ones(1)})
     assert os.listdir(tmp_path) == []
 
 
-def test_what_json_has_no_number_for_is_null(tmp_path):
+def test_infinity_and_nan_are_written_as_null(tmp_path):
     # Source of truth: RFC 8259, section 6: "Infinity and NaN are not permitted"
     path = tmp_path / "metrics.json"
     write_json(path, {"psnr": float("inf"), "rows": [(float("nan"), 1.5)], "down": -float("inf")})
@@ -166,13 +166,13 @@ def test_what_json_has_no_number_for_is_null(tmp_path):
     assert read_json(path) == {"psnr": None, "rows": [[None, 1.5]], "down": None}
 
 
-def test_a_changed_number_is_noticed(weights):
-    """Property: whichever bit of the content is flipped, the file is refused."""
+def test_a_changed_bit_is_detected(weights):
+    """Property: if a bit of any byte of the content is flipped, the file is refused."""
     content = weights.read_bytes()
     start = 8 + int.from_bytes(content[:8], "little")
     for at in range(start, len(content)):
         weights.write_bytes(content[:at] + bytes([content[at] ^ 16]) + content[at + 1 :])
-        assert "has changed since it was written" in complaint(weights, lambda: load_tensors(weights))
+        assert "has changed since it was written" in error_line(weights, lambda: load_tensors(weights))
 
 
 def test_a_file_without_a_checksum_is_read(weights):
@@ -188,15 +188,15 @@ def test_numbers_that_are_not_finite_are_neither_written_nor_read(weights, numbe
 
     before = weights.read_bytes()
     broken = {"whole": torch.ones(2), "layers.3.bias": torch.tensor([0.0, number], dtype=torch.bfloat16)}
-    message = complaint(weights, lambda: save_tensors(weights, broken))
+    message = error_line(weights, lambda: save_tensors(weights, broken))
     assert "NaN or infinity in layers.3.bias; nothing was written" in message
     assert weights.read_bytes() == before
     save_file(broken, weights)
-    assert "NaN or infinity in layers.3.bias" in complaint(weights, lambda: load_tensors(weights))
+    assert "NaN or infinity in layers.3.bias" in error_line(weights, lambda: load_tensors(weights))
 
 
 @pytest.mark.parametrize("radius", [-1.0, 0.0])
-def test_a_baked_sphere_without_an_inside_is_refused(tmp_path, radius):
+def test_a_baked_sphere_without_a_positive_radius_is_refused(tmp_path, radius):
     from safetensors.torch import load_file
 
     from hyperplanes.fields.baked import BakedField

@@ -1,4 +1,4 @@
-"""Source of truth: git, asked in the folder of a project; outside of a checkout the package's version."""
+"""Source of truth: git in the folder of the project; outside of a checkout, the version of the package."""
 
 import subprocess
 from importlib.metadata import version
@@ -21,7 +21,7 @@ def test_the_commit_is_that_of_this_checkout():
     assert find_commit().removesuffix("-dirty") == commit
 
 
-def test_changed_code_is_named_and_changed_results_are_not(tmp_path, monkeypatch):
+def test_changed_code_makes_the_commit_dirty_and_changed_results_do_not(tmp_path, monkeypatch):
     monkeypatch.setattr(environment, "ROOT", tmp_path.resolve())
     files = [tmp_path / "code.py", tmp_path / RESULTS / "rows.json"]
     files[1].parent.mkdir(parents=True)
@@ -48,7 +48,7 @@ def test_changed_code_is_named_and_changed_results_are_not(tmp_path, monkeypatch
         (None, True, False),
     ],
 )
-def test_amx_is_what_the_processor_has_and_linux_allows(monkeypatch, flags, allowed, expected):
+def test_amx_is_used_if_the_processor_has_it_and_linux_allows_it(monkeypatch, flags, allowed, expected):
     def read_text(path, encoding):
         if flags is None:
             raise FileNotFoundError
@@ -75,7 +75,7 @@ def test_amx_is_what_the_processor_has_and_linux_allows(monkeypatch, flags, allo
         (None, False, "AuthenticAMD avx512f", False),
     ],
 )
-def test_bfloat16_is_fast_where_onednn_may_use_what_the_processor_has(monkeypatch, limit, amx, processor, expected):
+def test_bfloat16_is_fast_if_onednn_may_use_its_instructions(monkeypatch, limit, amx, processor, expected):
     monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
     if limit:
         monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", limit)

@@ -1,4 +1,4 @@
-"""Source of truth: the operating system: pipes, locks and signals made on purpose."""
+"""Source of truth: the operating system, with pipes, locks and signals made here."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.mark.parametrize("read", [read_json, read_bytes, read_image, read_npz, load_tensors])
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path, read):
+def test_a_pipe_is_refused_without_waiting(tmp_path, read):
     path = tmp_path / "file"
     os.mkfifo(path)
     with pytest.raises(DataError, match=r"file: expected a regular file, found a pipe; copy"):
@@ -35,7 +35,7 @@ def test_devices_and_too_large_files_are_refused_unread(tmp_path):
         read_bytes("/dev/zero")
     large = tmp_path / "model.json"
     with open(large, "wb") as file:
-        file.truncate(2**40)  # sparse: it takes no room
+        file.truncate(2**40)  # a sparse file, which takes no disk space
     with pytest.raises(DataError, match=rf"expected at most 268435456 bytes, found {2**40}"):
         read_json(large)
     with pytest.raises(DataError, match="expected at most"):
@@ -50,7 +50,7 @@ def test_whole_numbers_beyond_64_bits_are_refused(tmp_path, number):
         read_json(path)
 
 
-def test_what_a_parser_did_not_expect_is_one_line_about_the_file():
+def test_unexpected_errors_of_parsers_become_one_line_about_the_file():
     for error in (KeyError("a"), TypeError("b"), OverflowError("c"), RuntimeError("d\nd"), IndexError()):
         with pytest.raises(DataError, match=r"^x: expected a thing, found something else: \w+.*; write") as caught:
             with malformed("x", "a thing"):
@@ -63,7 +63,7 @@ def test_what_a_parser_did_not_expect_is_one_line_about_the_file():
 
 
 def test_a_folder_has_one_writer(tmp_path):
-    """Property: of many who try at once each works alone, and nothing is left behind."""
+    """Property: of many concurrent writers, only one works at a time, and no files remain."""
     folder, working, most, refused = tmp_path / "out", [], [], []
 
     def work():
@@ -88,7 +88,7 @@ def test_a_folder_has_one_writer(tmp_path):
     assert list(folder.iterdir()) == []
 
 
-def test_every_verb_that_writes_locks_its_folder_and_names_a_file_in_its_place(tmp_path, capsys):
+def test_every_verb_that_writes_locks_its_folder_and_refuses_a_file(tmp_path, capsys):
     out, scene = tmp_path / "out", str(tmp_path)
     (tmp_path / "file").write_text("")
     verbs = {
@@ -103,7 +103,7 @@ def test_every_verb_that_writes_locks_its_folder_and_names_a_file_in_its_place(t
         for verb, options in verbs.items():
             assert main([verb, *options, "--out", str(out)]) == 2
             assert "found another hyperplanes at work there" in capsys.readouterr().err
-        # a file is written whole, so that others may write beside it
+        # bake writes one complete file, so that others may write to the same folder
         bake = ["bake", *verbs["render"], "--out"]
         assert main([*bake, str(out / "car.safetensors")]) == 2
         assert f"{tmp_path}: expected a checkpoint" in capsys.readouterr().err
@@ -125,8 +125,8 @@ def test_a_lock_ends_with_its_process(tmp_path):
         pass
 
 
-def test_a_folder_in_it_that_may_not_be_read_does_not_keep_anybody_from_writing(tmp_path):
-    """As lost+found of a disk; relative paths, as a user who is not root may not pass the folders above."""
+def test_an_unreadable_folder_inside_does_not_prevent_writing(tmp_path):
+    """As lost+found on a disk. Paths are relative, because the other user may not access the parent folders."""
     (tmp_path / "lost+found").mkdir(mode=0o700)
     tmp_path.chmod(0o777)
     code = (
@@ -138,7 +138,7 @@ def test_a_folder_in_it_that_may_not_be_read_does_not_keep_anybody_from_writing(
     assert (tmp_path / "a").read_bytes() == b"whole"
 
 
-def test_a_name_that_no_file_can_have_is_refused(tmp_path):
+def test_too_long_file_names_are_refused(tmp_path):
     assert inside(tmp_path, "a" * 255, "images.bin") == tmp_path / ("a" * 255)
     with pytest.raises(DataError, match="images.bin: expected file names of at most 255 bytes"):
         inside(tmp_path, "images/" + "1" * 252 + ".png", "images.bin")
@@ -159,7 +159,7 @@ def test_an_object_in_two_splits_is_refused(tmp_path):
         open_dataset(tmp_path)
 
 
-def test_an_array_that_claims_more_than_there_is_is_refused(tmp_path):
+def test_an_array_with_a_too_large_stated_size_is_refused(tmp_path):
     import zipfile
 
     path = tmp_path / "50_car.npz"
@@ -170,8 +170,8 @@ def test_an_array_that_claims_more_than_there_is_is_refused(tmp_path):
         read_npz(path)
 
 
-def test_the_checksum_of_a_folder_is_that_of_what_it_holds(tmp_path):
-    """Property: it changes with a file's name, size and time, in a folder or behind a link, and with nothing else."""
+def test_the_checksum_of_a_folder_depends_on_its_files(tmp_path):
+    """Property: it changes only with names, sizes and times of files, including those behind a link."""
     held, elsewhere = tmp_path / "held", tmp_path / "elsewhere"
     for folder in (held / "a", held / "runs", elsewhere):
         folder.mkdir(parents=True)
@@ -194,8 +194,8 @@ def test_the_checksum_of_a_folder_is_that_of_what_it_holds(tmp_path):
     assert len(set(found)) == len(found)
 
 
-def test_the_manifest_of_a_data_set_counts_in_place_of_the_times_of_its_files(tmp_path):
-    """Property: a data set made again is the same; another manifest, and a file of another size, are not."""
+def test_the_checksum_of_a_data_set_depends_on_its_manifest_not_on_file_times(tmp_path):
+    """Property: other file times do not change it; another manifest or a file of another size does."""
     manifest, picture = tmp_path / "manifest.json", tmp_path / "picture.png"
     manifest.write_bytes(b"1")
     picture.write_bytes(b"12")

@@ -1,4 +1,4 @@
-"""Source of truth: what every verb promises of Ctrl-C and SIGTERM: one line, an exit code, no half-written file."""
+"""Every verb handles Ctrl-C and SIGTERM with one line, an exit code, and no incomplete file."""
 
 import ctypes
 import os
@@ -29,7 +29,7 @@ CALLS = {
 
 @pytest.fixture(autouse=True)
 def _interruptible():
-    """Ctrl-C as Python has it: a suite that a script runs in its background inherits an ignored SIGINT."""
+    """Install Python's SIGINT handler, because tests that a script runs in the background inherit an ignored SIGINT."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -60,8 +60,8 @@ def test_a_signal_while_a_file_is_written_leaves_nothing_behind(verb, number, co
     assert children() <= before
 
 
-def test_an_interrupt_that_a_callback_swallows_is_raised_again(capfd):
-    """Python prints what a weak reference's callback raises and goes on: this loop would never end."""
+def test_an_interrupt_that_a_callback_ignores_is_raised_again(capfd):
+    """Python only prints exceptions of callbacks of weak references, so that this loop would not end."""
     before = signal.getsignal(signal.SIGTERM)
 
     class Value:
@@ -91,7 +91,7 @@ def test_an_ignored_signal_stays_ignored():
         signal.signal(signal.SIGINT, before)
 
 
-def test_cleaning_up_is_not_interrupted_again(monkeypatch):
+def test_cleanup_is_not_interrupted_again(monkeypatch):
     monkeypatch.setattr("hyperplanes.utilities.interrupts.AGAIN_SECONDS", 0.01)
     ended = []
 
@@ -108,8 +108,8 @@ def test_cleaning_up_is_not_interrupted_again(monkeypatch):
     assert ended
 
 
-def test_native_code_does_not_keep_signals_from_python():
-    """Of `pycolmap`, whose import takes SIGTERM for a trace of its own; here it is libc that ignores the signal."""
+def test_handlers_that_native_code_replaces_are_restored():
+    """The import of `pycolmap` installs its own SIGTERM handler; here, libc is used to ignore the signal."""
 
     def ignored_by_libc():
         with keep_handlers():

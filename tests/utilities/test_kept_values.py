@@ -1,4 +1,4 @@
-"""What is kept of tensors is what would be made of them now."""
+"""Cached values that are computed from tensors must be those of the current tensors."""
 
 import gc
 import weakref
@@ -11,7 +11,7 @@ from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.kept import kept
 
 
-def test_it_is_made_once_and_again_after_a_change_in_place_or_of_another_tensor():
+def test_a_value_is_computed_again_after_an_in_place_change_or_for_another_tensor():
     owner, made = SimpleNamespace(), []
 
     def asked(*tensors):
@@ -26,7 +26,7 @@ def test_it_is_made_once_and_again_after_a_change_in_place_or_of_another_tensor(
     assert len(made) == 3
 
 
-def test_the_memory_of_what_it_was_made_of_is_not_given_to_another_tensor():
+def test_the_tensors_of_a_cached_value_are_kept_alive():
     owner, value = SimpleNamespace(), torch.ones(1000)
     kept(owner, "sum", [value], lambda: 0)
     alive = weakref.ref(value)
@@ -35,7 +35,7 @@ def test_the_memory_of_what_it_was_made_of_is_not_given_to_another_tensor():
     assert alive() is not None
 
 
-def test_nothing_is_kept_of_what_a_function_transform_makes():
+def test_values_inside_function_transforms_are_not_cached():
     owner = SimpleNamespace()
 
     def squared(value):
@@ -46,7 +46,7 @@ def test_nothing_is_kept_of_what_a_function_transform_makes():
     assert float(squared(torch.ones(2))) == 2.0
 
 
-def test_a_compiled_graph_takes_what_was_made_before_it():
+def test_a_compiled_graph_uses_a_value_that_was_cached_before():
     grid = full(Sphere(), 4)
     expected = grid.box[0]
     times = torch.compile(lambda value: value * grid.box[0], backend="eager", fullgraph=True)

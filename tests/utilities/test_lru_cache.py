@@ -10,7 +10,7 @@ class Sized:
     nbytes: int
 
 
-def test_the_least_recently_used_goes_first():
+def test_the_least_recently_used_value_is_evicted_first():
     cache = LRUCache(30)
     for name in "abc":
         cache.add(name, Sized(10))
@@ -20,14 +20,14 @@ def test_the_least_recently_used_goes_first():
     assert (len(cache), cache.nbytes) == (3, 30)
 
 
-def test_a_value_in_the_place_of_another_counts_once():
+def test_a_replaced_value_counts_once():
     cache = LRUCache(30)
     cache.add("a", Sized(10))
     cache.add("a", Sized(20))
     assert (len(cache), cache.nbytes) == (1, 20)
 
 
-def test_a_value_above_the_budget_stays_only_where_the_last_one_is_to():
+def test_a_value_above_the_budget_stays_only_with_keep_last():
     for keep_last in (False, True):
         cache = LRUCache(30, keep_last=keep_last)
         cache.add("a", Sized(10))

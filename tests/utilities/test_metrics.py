@@ -12,7 +12,7 @@ from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ss
 
 @pytest.fixture(scope="module")
 def scikit_image():
-    """`skimage.metrics`, which takes half a second to import: not of each process that looks for tests."""
+    """`skimage.metrics`, imported late, because the import takes half a second in each process that collects tests."""
     return import_module("skimage.metrics")
 
 

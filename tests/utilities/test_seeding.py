@@ -1,4 +1,4 @@
-"""Source of truth: the same model made alone."""
+"""Source of truth: the same models, made one after the other."""
 
 from concurrent.futures import ThreadPoolExecutor
 

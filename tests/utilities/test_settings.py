@@ -1,4 +1,4 @@
-"""Settings from files and options. Source of truth: the dataclasses themselves, and what people write by hand."""
+"""Settings from files and options. Sources of truth: the dataclasses themselves, and files written by hand."""
 
 import json
 import re
@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def leaves(value, prefix=""):
-    """The paths of all entries that are no mappings, with their values."""
+    """The paths and values of all entries that are not mappings."""
     for name, entry in value.items():
         if isinstance(entry, dict):
             yield from leaves(entry, f"{prefix}{name}.")
@@ -40,7 +40,7 @@ def leaves(value, prefix=""):
 
 
 def other(value):
-    """Another value of the same kind, as it is written on the command line."""
+    """Another valid value of the same type, as written on the command line."""
     known = {
         "adam": "muon",
         "muon": "adam",
@@ -95,20 +95,20 @@ def test_every_field_of_every_configuration_can_be_set_by_an_option(base):
         assert {name for name in entries if now[name] != entries[name]} == {path}
 
 
-def test_a_whole_does_not_take_the_place_of_a_part_that_was_given_before():
+def test_a_whole_after_one_of_its_parts_is_refused():
     part, whole = ["--model.network.depth", "3"], ["--model.network", "{width: 4}"]
     assert parse_options([*whole, *part]) == {"model": {"network": {"width": 4, "depth": 3}}}
     with pytest.raises(SettingsError, match="given beside a part of it; leave one of them out"):
         parse_options([*part, *whole])
 
 
-def test_one_number_is_a_list_of_one_where_a_list_is_expected():
+def test_one_number_is_accepted_where_a_list_is_expected():
     made = changed(preset("small"), parse_options(["--training.views", "5"]))
     assert made.training.views == (5,)
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_configuration_written_is_the_one_read(name, tmp_path):
+def test_a_written_configuration_is_read_back(name, tmp_path):
     chosen = preset(name).by_method("multiplane")
     chosen = replace(chosen, training=replace(chosen.training, seed=4))
     write_experiment(tmp_path / "config.yaml", chosen)
@@ -132,7 +132,7 @@ def test_an_entry_that_lacks_a_part_is_named():
         ModelConfig.of_json(entries)
 
 
-def test_the_file_goes_before_the_preset_and_options_before_the_file(tmp_path):
+def test_a_file_overrides_the_preset_and_options_override_the_file(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(
         "preset: small\nmethod: nerf\nmodel: {network: {depth: 3}, protocol: hierarchical, sampling: {coarse: 8}}\n"
@@ -238,7 +238,7 @@ def test_a_wrong_setting_is_one_line(settings, words, tmp_path, capsys):
         ("", "expected a mapping of settings, found a NoneType"),
     ],
 )
-def test_a_file_that_is_no_experiment_is_refused(text, words, tmp_path):
+def test_a_file_without_valid_settings_is_refused(text, words, tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(text)
     with pytest.raises(DataError) as caught:
@@ -248,7 +248,7 @@ def test_a_file_that_is_no_experiment_is_refused(text, words, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_list_is_a_tuple_where_there_may_be_none():
+def test_a_list_becomes_an_optional_tuple():
     @dataclass(frozen=True)
     class Weights:
         values: tuple[float, ...] | None = None
@@ -275,7 +275,7 @@ def test_structures_are_nested_and_named_by_their_path():
     assert caught.value.path == "network.depth"
 
 
-def test_training_writes_a_configuration_that_trains_the_same_again(tmp_path, capsys):
+def test_the_configuration_that_training_writes_reproduces_it(tmp_path, capsys):
     data = str(demo_folder() / "data")
     first = ["--preset", "quick", "--steps", "2", "--training.rays", "8", "--model.network.planes", "6"]
     small = [
@@ -296,7 +296,7 @@ def test_training_writes_a_configuration_that_trains_the_same_again(tmp_path, ca
     assert list((tmp_path / "two" / "tensorboard").iterdir())
     capsys.readouterr()
     assert main(["presets", "quick"]) == 0
-    expected = {**asdict(preset("quick").training), "views": []}  # YAML has lists alone
+    expected = {**asdict(preset("quick").training), "views": []}  # YAML has only lists
     assert yaml.safe_load(capsys.readouterr().out)["training"] == expected
 
 
@@ -358,7 +358,7 @@ def test_a_method_of_another_package_is_made_and_described(other_package):
         make_method(Request("copycats"))
 
 
-def test_names_that_other_packages_bring_are_in_the_help(monkeypatch, capsys):
+def test_names_of_other_packages_are_in_the_help(monkeypatch, capsys):
     brought = {"hyperplanes.methods": ["copycat"], "hyperplanes.fields": ["constant"]}
     points = {group: [EntryPoint(name, "nowhere:nothing", group) for name in names] for group, names in brought.items()}
     monkeypatch.setattr("hyperplanes.cli.find_entries", lambda group: points.get(group, []))
@@ -380,7 +380,7 @@ def test_an_entry_point_that_cannot_be_imported_is_left_out_and_its_package_name
         assert "lost" not in find_verbs()
 
 
-def test_every_option_that_the_documents_name_is_one():
+def test_options_in_the_documentation_exist():
     bases = [preset("quick"), preset("quick").by_protocol("paper")]
     known = {"model.hypernetwork"}
     for base in bases:

@@ -1,4 +1,4 @@
-"""Optimisers without the compiler against those of torch.optim, which they are."""
+"""Optimisers that do not import the compiler, compared with those of torch.optim, which they subclass."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hyperplanes.utilities.uncompiled_optimisers import SGD, Adam
 
 
 def descend(make, **options) -> tuple[list[Tensor], dict]:
-    """Weights after five steps on a sum of squares, at rates that fall, and the state of the optimiser."""
+    """Weights after five steps on a sum of squares with decreasing rates, and the state of the optimiser."""
     weights = [torch.linspace(-1, 1, 12).reshape(4, 3).requires_grad_(), torch.ones(5, requires_grad=True)]
     optimiser = make(weights, lr=0.1, **options)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.9)
@@ -29,7 +29,7 @@ def descend(make, **options) -> tuple[list[Tensor], dict]:
     ("ours", "theirs", "options"),
     [(Adam, torch.optim.Adam, {"betas": (0.9, 0.99), "fused": True}), (SGD, torch.optim.SGD, {})],
 )
-def test_steps_are_those_of_torch(ours, theirs, options):
+def test_steps_agree_with_torch(ours, theirs, options):
     found, state = descend(ours, **options)
     expected, expected_state = descend(theirs, **options)
     assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
@@ -37,9 +37,9 @@ def test_steps_are_those_of_torch(ours, theirs, options):
     assert str(state) == str(expected_state)
 
 
-def test_optimisers_do_without_the_compiler(monkeypatch: pytest.MonkeyPatch):
-    """Its import takes longer than what most of them do."""
-    monkeypatch.setitem(sys.modules, "torch._dynamo", None)  # any import of it raises
+def test_optimisers_do_not_import_the_compiler(monkeypatch: pytest.MonkeyPatch):
+    """The import takes longer than most optimisations."""
+    monkeypatch.setitem(sys.modules, "torch._dynamo", None)  # importing it raises
     for name in ("adam", "muon", "sgd"):
         weights = [torch.ones(20, 20, requires_grad=True), torch.ones(3, requires_grad=True)]
         for optimiser in make_optimisers(weights, name, 0.1, 0.1):

@@ -1,4 +1,4 @@
-"""Source of truth: the environment of a fresh process after `import hyperplanes`, which is what OpenMP reads."""
+"""Source of truth: the environment of a new process after `import hyperplanes`, which OpenMP reads."""
 
 import os
 import subprocess
@@ -16,15 +16,15 @@ def policy(first, **variables):
     return run.stdout.split()[0]
 
 
-def test_threads_sleep_where_nobody_has_decided():
+def test_the_default_wait_policy_is_passive():
     assert policy("hyperplanes") == "PASSIVE"
 
 
-def test_what_the_user_decided_stays():
+def test_the_wait_policy_of_the_user_is_not_changed():
     assert policy("hyperplanes", OMP_WAIT_POLICY="ACTIVE") == "ACTIVE"
     assert policy("hyperplanes", GOMP_SPINCOUNT="1000") == "None"
 
 
-def test_nothing_is_set_once_torch_is_loaded():
-    """A module of its name stands for PyTorch, which takes seconds to load."""
+def test_no_wait_policy_is_set_after_torch_is_loaded():
+    """A fake module replaces PyTorch, which takes seconds to load."""
     assert policy("sys; sys.modules['torch'] = sys; import hyperplanes") == "None"

@@ -1,4 +1,4 @@
-"""What a worker may do to us, on request: a target for `data_gen.datasets.workers` in tests."""
+"""Work that fails on request, for tests of `data_gen.datasets.workers`."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ def serve(settings):
 def perform(item, folder):
     print("a library that prints to standard output")
     kind = item["kind"]
-    if kind == "once":  # fails the first time only
+    if kind == "once":  # fails only the first time
         marker = folder / "tried"
         kind = "fine" if marker.exists() else "crash"
         marker.touch()

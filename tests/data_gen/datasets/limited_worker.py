@@ -1,4 +1,4 @@
-"""The real renderer of objects, while the process may not write more than a kilobyte into a file."""
+"""The renderer of objects in a process that may not write more than one kilobyte to a file."""
 
 import resource
 import signal

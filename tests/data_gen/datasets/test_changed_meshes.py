@@ -1,4 +1,4 @@
-"""Source of truth: a data set made of the files as they are now, byte for byte."""
+"""Source of truth: a new data set of the changed files, byte for byte."""
 
 import json
 from dataclasses import replace
@@ -55,7 +55,7 @@ def anew(meshes):
         pytest.param([("b.obj", QUAD.replace("v 0 1 1", "v 0 2 1"))], id="a mesh changes and keeps its size"),
     ],
 )
-def test_an_object_is_made_again_when_a_file_of_it_changes_and_the_others_are_kept(meshes, steps):
+def test_only_an_object_with_a_changed_file_is_generated_again(meshes, steps):
     assert (run(meshes).written, run(meshes).reused) == (2, 2)
     for name, content in steps:
         if name.endswith(".png"):
@@ -69,7 +69,7 @@ def test_an_object_is_made_again_when_a_file_of_it_changes_and_the_others_are_ke
     assert (run(meshes).reused, run(meshes).changed) == (2, [])
 
 
-def test_a_mesh_that_was_skipped_is_drawn_once_it_is_repaired(meshes):
+def test_a_skipped_mesh_is_rendered_after_its_repair(meshes):
     assert [name for name, _ in run(meshes).skipped] == ["c"]
     trimesh.creation.icosphere(subdivisions=1).export(meshes / "c.glb")
     report = run(meshes)
@@ -77,7 +77,7 @@ def test_a_mesh_that_was_skipped_is_drawn_once_it_is_repaired(meshes):
     assert tree(meshes.parent / "out") == anew(meshes)
 
 
-def test_nothing_is_left_of_an_object_whose_mesh_can_no_longer_be_drawn(meshes):
+def test_an_object_is_removed_when_its_mesh_can_no_longer_be_rendered(meshes):
     run(meshes)
     (meshes / "b.obj").write_text("v 0 0 0\n")
     report = run(meshes)
@@ -86,14 +86,14 @@ def test_nothing_is_left_of_an_object_whose_mesh_can_no_longer_be_drawn(meshes):
     assert not (meshes.parent / "out/b").exists()
 
 
-def test_a_mesh_more_is_another_data_set_and_named(meshes):
+def test_a_new_mesh_makes_another_data_set_and_is_named(meshes):
     run(meshes)
     trimesh.creation.box().export(meshes / "d.ply")
     with pytest.raises(DataError, match=r"source\.splits\.c test, .*splits\.d None.*found.* train, .*splits\.d test;"):
         run(meshes)
 
 
-def test_meshes_of_data_sets_inside_the_folder_are_none_of_the_source(meshes):
+def test_meshes_of_data_sets_inside_the_folder_do_not_belong_to_the_source(meshes):
     config = replace(CONFIG, channels=("rgba", "mesh"))
     for out in (meshes / "out", meshes / "sets/other"):
         reports = [generate(MeshFolder(meshes), out, config) for _ in range(2)]
@@ -108,7 +108,7 @@ def test_meshes_of_data_sets_inside_the_folder_are_none_of_the_source(meshes):
     assert (alone.written, alone.skipped) == (2, []), "given itself, it is a folder of meshes"
 
 
-def test_which_file_a_model_is_and_what_it_is_made_of_is_in_the_manifest(meshes):
+def test_the_manifest_lists_the_file_of_each_model_and_the_files_that_it_uses(meshes):
     (meshes / "b.mtl").write_text(PAINT)
     (meshes / "стол").mkdir()
     (meshes / "a.ply").rename(meshes / "стол/a.ply")

@@ -1,4 +1,4 @@
-"""Source of truth: the geometry itself; a unit sphere's surface is known in closed form."""
+"""Source of truth: the surface of a unit sphere in closed form."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_normals_of_a_sphere_are_its_points(ball):
     assert (normals[seen] * coordinates[seen]).sum(-1).min() > 0.98
 
 
-def test_the_mesh_stands_where_the_cameras_look(ball):
+def test_the_mesh_is_where_the_cameras_look(ball):
     mesh = trimesh.load_scene(mesh_path(ball / "ball")).to_mesh()
     assert np.allclose(np.linalg.norm(mesh.vertices, axis=-1), 1.0, atol=1e-5)
     assert Dataset(ball).manifest["objects"]["ball"]["world_from_file"][0][0] == pytest.approx(1 / 7, rel=1e-5)

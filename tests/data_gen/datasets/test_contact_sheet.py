@@ -8,7 +8,7 @@ import pytest
 from data_gen.datasets.contact_sheet import contact_sheet
 
 
-def test_images_lie_in_rows_over_white():
+def test_images_are_placed_in_rows_over_white():
     colours = [(250, 0, 0), (0, 250, 0), (0, 0, 250)]
     images = [np.full((6, 8, 3), colour, dtype=np.uint8) for colour in colours]
     sheet = contact_sheet(images, columns=2)

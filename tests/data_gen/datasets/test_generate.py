@@ -1,4 +1,4 @@
-"""Source of truth: an uninterrupted run of the same generation, byte for byte; the cameras that were asked for."""
+"""Source of truth: an uninterrupted run of the same generation, byte for byte, and the requested cameras."""
 
 import hashlib
 import json
@@ -64,7 +64,7 @@ def whole(tmp_path_factory):
     return out, report
 
 
-def test_a_data_set_is_what_was_asked_for(whole):
+def test_a_data_set_has_the_requested_objects_views_and_cameras(whole):
     out, report = whole
     assert (report.written, report.reused, report.skipped) == (5, 0, [])
     data = Dataset(out)
@@ -84,7 +84,7 @@ def test_a_data_set_is_what_was_asked_for(whole):
     assert not (out / ".progress").exists()
 
 
-def test_the_manifest_tells_how_it_was_made_and_holds_no_path_of_this_machine(whole):
+def test_the_manifest_has_the_settings_and_no_path_of_this_machine(whole):
     text = (whole[0] / "manifest.json").read_text()
     manifest = json.loads(text)
     assert manifest["configuration"]["source"] == {"class_name": "car", "count": 5, "seed": 3}
@@ -99,7 +99,7 @@ def test_the_manifest_tells_how_it_was_made_and_holds_no_path_of_this_machine(wh
 
 
 @pytest.mark.usefixtures("here")
-def test_verify_finds_what_is_missing_and_what_has_changed(whole, tmp_path):
+def test_verify_finds_missing_and_changed_files(whole, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(whole[0], out)
     assert verify(out).intact
@@ -117,7 +117,7 @@ def test_verify_finds_what_is_missing_and_what_has_changed(whole, tmp_path):
 
 
 def goes_on(out, whole, reused):
-    """Generated again, what was left after so many objects becomes the whole data set."""
+    """Check that a second run completes a data set that was interrupted after some objects."""
     assert not (out / "manifest.json").exists(), "the end of the run was not awaited"
     (out / ".progress/unfinished/.junk.part").write_bytes(b"half a file")
     with rendered_here():
@@ -127,7 +127,7 @@ def goes_on(out, whole, reused):
     assert tree(out) == tree(whole[0])
 
 
-def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whole, tmp_path):
+def test_a_killed_generation_is_completed_with_the_same_bytes(whole, tmp_path):
     out = tmp_path / "cars"
     root = str(Path(objects.__file__).parents[2])
     process = subprocess.Popen(
@@ -144,8 +144,8 @@ def test_killed_at_any_moment_and_started_again_it_ends_with_the_same_bytes(whol
 
 
 @pytest.mark.usefixtures("here")
-def test_interrupted_and_started_again_it_ends_with_the_same_bytes(whole, tmp_path):
-    """KeyboardInterrupt is what Python makes of Ctrl-C."""
+def test_an_interrupted_generation_is_completed_with_the_same_bytes(whole, tmp_path):
+    """Python raises KeyboardInterrupt on Ctrl-C."""
 
     def interrupt(done, *_):
         if done == 2:
@@ -181,7 +181,7 @@ def test_two_generations_do_not_write_into_one_folder(tmp_path):
 
 
 @pytest.mark.usefixtures("here")
-def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path):
+def test_a_broken_mesh_is_skipped_with_a_reason_and_the_others_are_rendered(tmp_path):
     meshes = tmp_path / "meshes"
     meshes.mkdir()
     trimesh.creation.box().export(meshes / "box.ply")
@@ -213,7 +213,7 @@ def test_a_broken_mesh_is_skipped_with_its_reason_and_the_rest_is_done(tmp_path)
 
 
 @pytest.mark.usefixtures("here")
-def test_a_split_that_has_lost_objects_is_named(tmp_path):
+def test_a_split_with_skipped_objects_is_named(tmp_path):
     meshes = tmp_path / "meshes"
     meshes.mkdir()
     for name in "abcdef":
@@ -230,7 +230,7 @@ def test_a_split_that_has_lost_objects_is_named(tmp_path):
     assert [line.partition(";")[0] for line in remarks(alone, tmp_path)] == ["no objects in the split test: 0 of 1"]
 
 
-def test_the_axis_is_that_of_the_format_unless_a_file_or_folder_is_named(tmp_path):
+def test_the_up_axis_is_that_of_the_format_except_for_named_files_and_folders(tmp_path):
     for name in ("a.obj", "b.glb", "c.dae", "scans/d.glb", "scans/e.ply", "scans/old/f.stl"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
@@ -252,8 +252,8 @@ def test_the_axis_is_that_of_the_format_unless_a_file_or_folder_is_named(tmp_pat
 
 
 @pytest.mark.usefixtures("here")
-def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypatch):
-    """A renderer whose files may not grow beyond 1 kB stands for a disk that is full."""
+def test_a_full_disk_is_a_one_line_error_and_leaves_no_partial_files(tmp_path, monkeypatch):
+    """A renderer that may not write files above 1 kB simulates a full disk."""
     monkeypatch.setattr("data_gen.datasets.generate.TARGET", "limited_worker:open_renderer")
     with pytest.raises(DataError, match=r"expected room to write \d+ bytes, found .*; ") as caught:
         generate(CARS, tmp_path / "out", GenerationConfig(held_out=2, views=4, resolution=64, workers=1))
@@ -294,13 +294,13 @@ def test_a_full_disk_is_one_line_and_nothing_is_half_written(tmp_path, monkeypat
         ({"held_out": 9}, "held_out: expected a fraction below 1 or a count up to 5 of each class, got 9"),
     ],
 )
-def test_arguments_that_make_no_sense_are_named(tmp_path, arguments, message):
+def test_invalid_arguments_are_named(tmp_path, arguments, message):
     with pytest.raises(ValueError, match=message):
         generate(CARS, tmp_path / "out", GenerationConfig(**arguments))
     assert not (tmp_path / "out").exists()
 
 
-def test_names_that_the_authors_layout_makes_the_same_are_refused(tmp_path):
+def test_names_that_are_equal_in_the_authors_layout_are_refused(tmp_path):
     for name in ("a_1", "a-1"):
         trimesh.creation.box().export(tmp_path / f"{name}.ply")
     config = GenerationConfig(layout="hyperplanes-200", views=2)
@@ -322,7 +322,7 @@ def test_options_of_the_other_source_are_refused(given, message):
 
 
 @pytest.mark.usefixtures("here")
-def test_the_authors_layout_takes_the_classes_that_their_loader_knows(tmp_path):
+def test_the_authors_layout_takes_only_the_classes_of_their_loader(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.ply")
     config = GenerationConfig(layout="hyperplanes-200", views=2, held_out=0, workers=1)
     for source, found in (
@@ -344,8 +344,8 @@ def test_data_sets_of_one_seed_share_objects_and_never_mix_training_and_held_out
 
 
 @pytest.mark.parametrize("count_of_seeds", [2**9, 2**32])
-def test_an_object_that_would_be_another_is_drawn_again_and_no_other(monkeypatch, count_of_seeds):
-    """Of 200 draws from 512 numbers some 34 are another's; in order, the training objects before the held-out ones."""
+def test_only_an_object_with_the_seed_of_another_gets_a_new_seed(monkeypatch, count_of_seeds):
+    """About 34 of 200 draws from 512 numbers repeat one. Each training object comes before its held-out one."""
 
     class Sequence(np.random.SeedSequence):
         def generate_state(self, words):
@@ -365,14 +365,14 @@ def test_an_object_that_would_be_another_is_drawn_again_and_no_other(monkeypatch
         assert part.items() <= whole.items(), "data sets of one seed share objects"
 
 
-def test_mesh_files_are_split_by_name_four_to_one(tmp_path):
+def test_meshes_are_split_four_to_one_by_name(tmp_path):
     for index in range(10):
         trimesh.creation.box().export(tmp_path / f"mesh{index}.ply")
     splits = [item.split for item in list_items(MeshFolder(tmp_path), None).items]
     assert splits == ["train"] * 8 + ["test"] * 2
 
 
-def test_random_rigs_differ_between_objects_and_agree_between_runs():
+def test_random_rigs_differ_between_objects_but_not_between_runs():
     config = GenerationConfig(rig="random", views=3, resolution=8, seed=5).resolve()
     first, again, other = (config.make_rig(name).world_from_camera for name in ("a", "a", "b"))
     assert np.array_equal(first, again)
@@ -380,20 +380,20 @@ def test_random_rigs_differ_between_objects_and_agree_between_runs():
 
 
 @pytest.mark.usefixtures("here")
-def test_progress_is_told(tmp_path):
+def test_progress_is_reported(tmp_path):
     told = []
     generate(Procedural("car", 2), tmp_path, GenerationConfig(**SMALL), progress=lambda *state: told.append(state))
     assert [state[:2] for state in told] == [(1, 2), (2, 2)]
 
 
-def test_the_manifest_names_the_version_that_made_it(whole):
+def test_the_manifest_has_the_version_of_the_generator(whole):
     manifest = json.loads((whole[0] / "manifest.json").read_text())
     assert manifest["configuration"]["generator"] == f"hyperplanes {version('hyperplanes')}, pictures {PICTURES}"
     assert manifest["configuration"]["supersample"] == SUPERSAMPLE
 
 
 @pytest.mark.usefixtures("here")
-def test_files_that_have_changed_are_made_again_when_asked(tmp_path, whole):
+def test_changed_files_are_generated_again_if_requested(tmp_path, whole):
     out = shutil.copytree(whole[0], tmp_path / "cars")
     for name in ("car_00001/images/002.png", "car_test_00000/transforms.json"):
         (out / name).write_bytes(b"worm")
@@ -404,7 +404,7 @@ def test_files_that_have_changed_are_made_again_when_asked(tmp_path, whole):
 
 
 @pytest.mark.usefixtures("here")
-def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
+def test_rigs_of_the_paper_define_distance_lens_and_sizes(tmp_path):
     car = Procedural("car", 1, seed=3)
     generate(car, tmp_path / "200", GenerationConfig(rig="paper-200", resolution=8, held_out=0, workers=1))
     task = Dataset(tmp_path / "200").task("car_00000")
@@ -425,7 +425,7 @@ def test_rigs_of_the_paper_bring_their_own_distance_lens_and_sizes(tmp_path):
         generate(car, tmp_path / "64", GenerationConfig(rig="paper-64"))
 
 
-def test_a_class_that_the_split_file_leaves_out_whole_is_trained_on_and_named(tmp_path):
+def test_a_class_without_entries_in_the_split_file_is_for_training_and_named(tmp_path):
     for synset, name in (("02958343", "a"), ("03001627", "x"), ("03001627", "y")):
         path = tmp_path / "tree" / synset / name / "model.obj"
         path.parent.mkdir(parents=True)
@@ -442,7 +442,7 @@ def test_a_class_that_the_split_file_leaves_out_whole_is_trained_on_and_named(tm
 
 
 @pytest.mark.usefixtures("here")
-def test_an_official_split_file_decides(tmp_path):
+def test_an_official_split_file_is_used(tmp_path):
     tree_of_cars = tmp_path / "ShapeNetCore.v1"
     for name in "abcd":
         path = tree_of_cars / "02958343" / name / "model.obj"

@@ -1,4 +1,4 @@
-"""Source of truth: a ball drawn in closed form, written as it should be and with poses mistaken for others."""
+"""Source of truth: a ball in closed form, written with correct poses and with poses of wrong conventions."""
 
 import json
 import math
@@ -20,7 +20,7 @@ CENTRE, RADIUS, SIZE, ANGLE = np.array([0.2, 0.1, 0.0]), 0.5, 32, 0.8
 
 
 def write(folder, change=lambda pose: pose, alpha=True):
-    """Views of a ball; `change` gets each OpenGL camera-to-world pose and returns what is written."""
+    """Write views of a ball; `change` maps each OpenGL camera-to-world pose to the written one."""
     (folder / "images").mkdir(parents=True)
     focal = SIZE / 2 / math.tan(ANGLE / 2)
     rows, columns = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
@@ -40,19 +40,19 @@ def write(folder, change=lambda pose: pose, alpha=True):
 
 @pytest.fixture
 def untried(monkeypatch):
-    """What is found out does not depend on the trial, which takes most of the time."""
+    """Omit the trial, which takes most of the time and does not change the report."""
     monkeypatch.setattr(inspecting, "_trial", lambda _: [])
 
 
 @pytest.fixture
 def undrawn(untried, monkeypatch):
-    """Nor on pictures."""
+    """Omit the trial and the pictures."""
     monkeypatch.setattr(inspecting, "_cameras", lambda *_: b"")
     monkeypatch.setattr(picture, "draw_coverage", lambda *_: b"")
 
 
 @pytest.mark.usefixtures("untried")
-def test_a_right_data_set_is_described_and_drawn(tmp_path):
+def test_a_correct_data_set_is_described_and_drawn(tmp_path):
     found = inspect(write(tmp_path / "ball"), tmp_path / "out")
     (one,) = found.description.objects
     assert (one.name, one.support, one.query, one.size) == ("ball", 6, 6, (SIZE, SIZE))
@@ -80,7 +80,7 @@ def test_a_right_data_set_is_described_and_drawn(tmp_path):
         (lambda pose: np.linalg.inv(pose @ FLIP), "camera-from-world in OpenCV axes, not OpenGL camera-to-world"),
     ],
 )
-def test_poses_that_are_mistaken_are_recognised_and_named(tmp_path, change, name):
+def test_poses_of_wrong_conventions_are_recognised_and_named(tmp_path, change, name):
     found = inspect(write(tmp_path / "ball", change), tmp_path / "out")
     assert found.has_problems
     assert found.description.objects[0].conventions.best == name
@@ -88,14 +88,14 @@ def test_poses_that_are_mistaken_are_recognised_and_named(tmp_path, change, name
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_without_masks_it_says_that_nothing_was_checked(tmp_path):
+def test_without_masks_the_report_says_that_nothing_was_checked(tmp_path):
     found = inspect(write(tmp_path / "ball", alpha=False), tmp_path / "out")
     assert not found.has_problems
     assert "conventions: not checked, there are no masks, and only 0 corners could be matched" in found.lines()
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_an_object_that_cannot_be_read_is_listed_and_the_rest_is_looked_at(tmp_path):
+def test_an_unreadable_object_is_listed_and_the_others_are_inspected(tmp_path):
     for name in ("a", "b"):
         write(tmp_path / "set" / name)
     (tmp_path / "set/a/images/03.png").write_bytes(b"")
@@ -108,8 +108,8 @@ def test_an_object_that_cannot_be_read_is_listed_and_the_rest_is_looked_at(tmp_p
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_objects_are_looked_at_from_all_splits(tmp_path):
-    """A row of the contact sheet each: 3 support views of 32 pixels."""
+def test_objects_of_all_splits_are_inspected(tmp_path):
+    """Each object is one row of the contact sheet, with 3 support views of 32 pixels."""
     for index in range(7):
         folder = write(tmp_path / f"set/o{index}")
         document = json.loads((folder / "transforms.json").read_text())
@@ -123,7 +123,7 @@ def test_objects_are_looked_at_from_all_splits(tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_an_empty_hull_is_not_said_to_be_a_lack_of_masks(tmp_path):
+def test_an_empty_hull_is_not_reported_as_missing_masks(tmp_path):
     folder = write(tmp_path / "ball")
     document = json.loads((folder / "transforms.json").read_text())
     document["scene_sphere"] = {"centre": [-0.8, 0.1, 0.0], "radius": 0.1}
@@ -134,8 +134,8 @@ def test_an_empty_hull_is_not_said_to_be_a_lack_of_masks(tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_what_two_views_cannot_tell_is_no_problem(tmp_path):
-    """One support view: no point is the nearest to one axis, and one mask is the silhouette of a hull anywhere."""
+def test_checks_that_need_more_than_two_views_report_no_problem(tmp_path):
+    """With one support view, no point is nearest to its axis, and hulls at any distance have the mask as silhouette."""
     with rendered_here():
         generate(Procedural("car", 2), tmp_path / "cars", GenerationConfig(views=2, resolution=32, workers=1))
     found = inspect(tmp_path / "cars", tmp_path / "out")
@@ -146,6 +146,6 @@ def test_what_two_views_cannot_tell_is_no_problem(tmp_path):
     assert "there are no masks" not in text
 
 
-def test_a_data_set_of_which_nothing_is_looked_at_is_refused(tmp_path):
+def test_inspecting_no_object_is_refused(tmp_path):
     with pytest.raises(ValueError, match="objects: expected at least 1 to look at, got 0"):
         inspect(write(tmp_path / "ball"), tmp_path / "out", 0)

@@ -1,4 +1,4 @@
-"""Source of truth: the pictures and the rig that went in; what other projects' loaders do, in a few lines each."""
+"""Source of truth: the original pictures and rig, and the loaders of other projects in a few lines each."""
 
 import json
 import shutil
@@ -76,7 +76,7 @@ def test_a_round_trip_gives_the_same_pixels_and_the_same_rays(layout, tmp_path):
         for views, part in ((task.support, slice(0, None, 2)), (task.query, slice(1, None, 2))):
             alpha = original.rgba[part, ..., 3:].astype(np.float32) / 255
             white = original.rgba[part, ..., :3] / np.float32(255) * alpha + 1 - alpha
-            exact = layout != "srn"  # SRN's pictures have no alpha: what is over white was rounded to 8 bits
+            exact = layout != "srn"  # SRN's pictures have no alpha; over white they are rounded
             tolerance = 1e-6 if exact else 0.5 / 255 + 1e-6
             assert np.abs(views.images.permute(0, 2, 3, 1).numpy() - white).max() <= tolerance
             if exact:
@@ -90,8 +90,8 @@ def test_a_round_trip_gives_the_same_pixels_and_the_same_rays(layout, tmp_path):
             assert torch.allclose(turned, camera.camera_from_world(wanted)[:, :3, :3], atol=1e-6)
 
 
-def test_learnits_loader_finds_what_it_reads(tmp_path):
-    """As the learned initialisations' code does it: base name of file_path + .png, angle, OpenGL poses."""
+def test_the_loader_of_learnit_reads_its_layout(tmp_path):
+    """As in the code of the learned initialisations: base name of file_path + .png, angle, OpenGL poses."""
     original = write("learnit-128", tmp_path)[0]
     splits = json.loads((tmp_path / "car_splits.json").read_text())
     assert splits == {"train": ["car_00000", "car_00001"], "val": [], "test": ["car_test_00000"]}
@@ -108,8 +108,8 @@ def test_learnits_loader_finds_what_it_reads(tmp_path):
     assert 2.0 < original.rig.near < original.rig.far < 6.0
 
 
-def test_the_authors_loader_finds_what_it_reads(tmp_path):
-    """As the HyperPlanes authors' code does it: floats in [0, 1], cam_poses, 277.77 pixels, name after the last _."""
+def test_the_loader_of_the_authors_reads_its_layout(tmp_path):
+    """As in the code of the HyperPlanes authors: floats in [0, 1], cam_poses, 277.77 pixels, name after the last _."""
     original = write("hyperplanes-200", tmp_path)[2]
     path = sorted((tmp_path / "cars/sampled").glob("*.npz"))[-1]
     assert path.name == f"{VIEWS}_car-test-00000.npz"
@@ -128,7 +128,7 @@ def test_the_authors_loader_finds_what_it_reads(tmp_path):
     assert 2.0 < original.rig.near < original.rig.far < 6.0
 
 
-def test_the_authors_own_files_are_read_without_our_additions(tmp_path):
+def test_files_of_the_authors_are_read_without_the_additions_of_the_generator(tmp_path):
     original = write("hyperplanes-200", tmp_path, manifest=False)[0]
     for path in (tmp_path / "cars/sampled").iterdir():
         with np.load(path) as arrays:
@@ -145,7 +145,7 @@ def test_the_authors_own_files_are_read_without_our_additions(tmp_path):
     ]
     legacy = catalogue(tmp_path, {}, legacy=True).read("car-00000").support
     assert camera.intrinsics(legacy.cameras)[0, :2, 2].tolist() == [100.0, 100.0]
-    centres = original.rig.world_from_camera[:, :3, 3]  # the first half, as the authors' code splits them
+    centres = original.rig.world_from_camera[:, :3, 3]  # the first half, as in the authors' code
     assert np.allclose(camera.centres(views.cameras), centres[: VIEWS // 2], atol=1e-5)
     opened = open_dataset(tmp_path, legacy=True).task("car-00000").query
     assert camera.intrinsics(opened.cameras)[0, :2, 2].tolist() == [100.0, 100.0]
@@ -153,7 +153,7 @@ def test_the_authors_own_files_are_read_without_our_additions(tmp_path):
     assert len(read_views(next((tmp_path / "cars/sampled").iterdir()))) == VIEWS
 
 
-def test_learnits_own_files_are_split_as_its_notebook_does_and_missing_objects_are_counted(tmp_path, capsys):
+def test_files_of_learnit_are_split_as_in_its_notebook_and_missing_objects_are_counted(tmp_path, capsys):
     original = write("learnit-128", tmp_path, manifest=False)[0]
     shutil.rmtree(tmp_path / "cars" / "car_00001")
     data = open_dataset(tmp_path)
@@ -174,8 +174,8 @@ def test_learnits_own_files_are_split_as_its_notebook_does_and_missing_objects_a
         open_dataset(tmp_path)
 
 
-def test_srns_loader_finds_what_it_reads(tmp_path):
-    """As pixelNeRF's code does it: first line f cx cy, last line height width, poses OpenCV camera-to-world."""
+def test_the_loader_of_srn_reads_its_layout(tmp_path):
+    """As in pixelNeRF's code: first line f cx cy, last line height width, poses OpenCV camera-to-world."""
     original = write("srn", tmp_path)[2]
     folder = tmp_path / "cars_test/car_test_00000"
     lines = (folder / "intrinsics.txt").read_text().splitlines()
@@ -192,8 +192,8 @@ def test_srns_loader_finds_what_it_reads(tmp_path):
 
 
 @pytest.mark.parametrize(("class_name", "near", "far"), [("car", 0.8, 1.8), ("chair", 1.25, 2.75), ("lamp", 0.8, 1.8)])
-def test_pixel_nerfs_planes_lose_nothing_of_an_object_in_srns_layout(class_name, near, far):
-    """Its loader: z_near, z_far = 1.25, 2.75 where "chair" is in the path of the data set, else 0.8 and 1.8."""
+def test_objects_in_the_layout_of_srn_lie_between_near_and_far_of_pixel_nerf(class_name, near, far):
+    """Its loader has z_near, z_far = 1.25, 2.75 if "chair" is in the path of the data set, else 0.8, 1.8."""
     rig = rendered("srn", Item("a", class_name, "train", seed=1)).rig
     depths = np.linalg.norm(rig.world_from_camera[:, :3, 3], axis=1) * LAYOUTS["srn"].scale
     assert (depths - 0.5 >= near - 1e-9).all()
@@ -207,7 +207,7 @@ def test_pixel_nerfs_planes_lose_nothing_of_an_object_in_srns_layout(class_name,
         ({(0, 2): 1.2}, ("learnit-128", "hyperplanes-200")),
     ],
 )
-def test_what_a_layout_cannot_hold_of_a_lens_is_refused(changes, layouts):
+def test_lenses_that_a_layout_cannot_describe_are_refused(changes, layouts):
     for layout in layouts:
         one = rendered(layout, ITEMS[0])
         lens = one.rig.intrinsics.copy()
@@ -221,7 +221,7 @@ def test_what_a_layout_cannot_hold_of_a_lens_is_refused(changes, layouts):
             LAYOUTS[layout].files(replace(one, rig=replace(one.rig, intrinsics=lens)))
 
 
-def test_other_channels_come_back_exactly(tmp_path):
+def test_other_channels_are_read_back_exactly(tmp_path):
     random = np.random.default_rng(0)
     channels = {
         "depth": random.random((VIEWS, 20, 20), dtype=np.float32),

@@ -1,4 +1,4 @@
-"""Source of truth: the same generation by local processes, byte for byte; needs ray, which is optional."""
+"""Source of truth: the same generation by local processes, byte for byte. The tests need ray, which is optional."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="ray is not inst
 
 
 def run(script, *arguments):
-    """In a process of its own: ray leaves threads and sockets behind, and warns about them."""
+    """Run code in a separate process, since ray leaves threads and sockets open and warns about them."""
     code = f"import sys; sys.path[:0] = [{str(HERE.parents[2])!r}, {str(HERE)!r}]\n{script}"
     return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
 
@@ -35,7 +35,7 @@ def test_a_cluster_writes_the_same_bytes(tmp_path):
 
 
 @needs_ray
-def test_an_actor_that_dies_costs_one_item(tmp_path):
+def test_an_actor_that_dies_loses_one_item(tmp_path):
     script = (
         "from data_gen.datasets.ray_cluster import run_on_ray\n"
         "import os; os.environ['PYTHONPATH'] = os.pathsep.join([*sys.path[:2], os.environ.get('PYTHONPATH', '')])\n"

@@ -1,4 +1,4 @@
-"""Source of truth: what each faulty item is written to do (faulty_worker.py), counted."""
+"""Source of truth: the known failure of each faulty item (faulty_worker.py), counted."""
 
 import os
 import subprocess
@@ -25,7 +25,7 @@ def run(monkeypatch, tmp_path):
     return start
 
 
-def test_every_item_has_one_outcome_and_failures_cost_only_themselves(run):
+def test_every_item_has_one_outcome_and_failures_affect_no_others(run):
     kinds = ["fine", "crash", "fine", "wrong", "exit", "bug", "once", "fine", "fine"]
     outcomes = {int(outcome.item["name"]): outcome for outcome in run(kinds)}
     assert sorted(outcomes) == list(range(len(kinds)))
@@ -39,7 +39,7 @@ def test_every_item_has_one_outcome_and_failures_cost_only_themselves(run):
     assert outcomes[5].reason == "KeyError: 'colour'"
 
 
-def test_a_hanging_worker_is_ended_and_the_rest_goes_on(run):
+def test_a_hanging_worker_is_ended_and_the_others_continue(run):
     begun = time.monotonic()
     outcomes = {outcome.item["name"]: outcome for outcome in run(["hang", "fine", "fine"], timeout=0.5)}
     assert outcomes["0"].reason == (
@@ -55,7 +55,7 @@ def test_workers_are_recycled(run):
     assert [processes.count(process) for process in dict.fromkeys(processes)] == [2, 2, 1]
 
 
-def test_trouble_that_is_no_items_ends_the_run(run):
+def test_errors_that_do_not_belong_to_an_item_end_the_run(run):
     with pytest.raises(WorkerError, match="^disk is full$"):
         list(run(["full", "fine"]))
     with pytest.raises(WorkerError, match="^RuntimeError: no renderer here$"):
@@ -65,7 +65,7 @@ def test_trouble_that_is_no_items_ends_the_run(run):
 
 
 def test_items_are_taken_as_workers_become_free(run):
-    """Property: the generator is never more than the workers ahead of the outcomes."""
+    """Property: no more items are taken than there are outcomes and workers."""
     taken = []
 
     def kinds():
@@ -104,7 +104,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
         try:
             os.kill(process, 0)
             if Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
-                return  # ended, and not yet collected by whoever inherited it
+                return  # ended, but not yet reaped by its new parent
         except (ProcessLookupError, FileNotFoundError):
             return
         time.sleep(0.1)

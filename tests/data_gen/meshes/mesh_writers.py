@@ -1,4 +1,4 @@
-"""Writes small mesh files byte by byte, so that the tests do not depend on a library's exporter."""
+"""Writers of small mesh files byte by byte, so that tests do not depend on the exporter of a library."""
 
 import io
 import json
@@ -13,7 +13,7 @@ SQUARE_UV = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=np.float32)
 
 
 def picture(mode="RGB", size=(4, 4), colour=None):
-    """Bytes of a PNG of one colour."""
+    """The bytes of a PNG of one colour."""
     stream = io.BytesIO()
     PIL.Image.new(mode, size, colour).save(stream, "PNG")
     return stream.getvalue()
@@ -101,7 +101,7 @@ def write_glb(path, **keywords):
 
 
 def write_gltf(folder, *, change=None, **keywords):
-    """Write a glTF file with its buffer beside it, after a change to its JSON, and return its path."""
+    """Write a glTF file with a changed JSON and with its buffer next to it, and return its path."""
     header, buffer = gltf(**keywords)
     header["buffers"][0]["uri"] = "mesh.bin"
     (folder / "mesh.bin").write_bytes(buffer)
@@ -140,7 +140,7 @@ def write_obj(folder, *, mtl=None, texture=None, body=OBJ_SOLID + "usemtl paint\
 
 
 def ply_bytes(*, binary=True, positions=TETRAHEDRON, faces=TETRAHEDRON_FACES, colours=None):
-    """A PLY file with triangles, and colours of its vertices if given."""
+    """A PLY file with triangles and, if given, colours of the vertices."""
     kind = "binary_little_endian" if binary else "ascii"
     head = f"ply\nformat {kind} 1.0\nelement vertex {len(positions)}\n"
     head += "".join(f"property float {axis}\n" for axis in "xyz")

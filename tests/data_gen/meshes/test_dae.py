@@ -16,7 +16,7 @@ def written(folder, text):
     return folder / "a.dae"
 
 
-def test_what_a_controller_deforms_is_drawn_and_said(tmp_path):
+def test_geometry_of_controllers_is_drawn_with_a_warning(tmp_path):
     text = dae_text().replace("<library_visual_scenes>", CONTROLLER)
     text = text.replace('<instance_geometry url="#g">', '<instance_controller url="#c"><skeleton>#j</skeleton>')
     mesh = load_mesh(written(tmp_path, text.replace("</instance_geometry>", "</instance_controller>")))
@@ -24,8 +24,8 @@ def test_what_a_controller_deforms_is_drawn_and_said(tmp_path):
     assert mesh.warnings == ("1 controllers: drawn in the pose of their meshes, not of their skeletons",)
 
 
-def test_what_glows_is_as_bright_as_what_is_lit(tmp_path):
-    # 0.5 in sRGB is 0.214 of linear light, whether a surface reflects or emits it
+def test_emission_is_as_bright_as_diffuse_colour(tmp_path):
+    # 0.5 in sRGB is 0.214 in linear light, for reflected and for emitted light
     glow = "<emission><color>0.5 0 1 1</color></emission><diffuse>"
     text = dae_text(diffuse="<color>0.5 0 1 1</color>").replace("<diffuse>", glow)
     (part,) = mesh_parts(load_mesh(written(tmp_path, text)))
@@ -33,7 +33,7 @@ def test_what_glows_is_as_bright_as_what_is_lit(tmp_path):
     np.testing.assert_allclose(linear_factor(part.visual.material)[:3], [0.21404, 0, 1], atol=0.003)
 
 
-def test_what_pycollada_leaves_out_is_said(tmp_path):
+def test_features_that_pycollada_omits_are_named(tmp_path):
     text = dae_text()
     lost = '<node id="n2"><instance_geometry url="#gone"/></node></visual_scene>'
     mesh = load_mesh(written(tmp_path, text.replace("</visual_scene>", lost)))
@@ -44,7 +44,7 @@ def test_what_pycollada_leaves_out_is_said(tmp_path):
 
 
 @pytest.mark.parametrize(("tag", "corners"), [("tristrips", "0 2 1 3"), ("trifans", "0 2 1 3")])
-def test_strips_and_fans_are_drawn_and_not_said_to_be_left_out(tmp_path, tag, corners):
+def test_strips_and_fans_are_drawn_without_a_warning(tmp_path, tag, corners):
     text = dae_text().replace('<triangles count="4" material="s">', f'<{tag} count="1" material="s">')
     text = text.replace("</triangles>", f"</{tag}>")
     text = text.replace(" ".join(str(index) for index in np.reshape(TETRAHEDRON_FACES, -1)), corners)
@@ -53,13 +53,13 @@ def test_strips_and_fans_are_drawn_and_not_said_to_be_left_out(tmp_path, tag, co
     assert mesh.warnings == ()
 
 
-def test_lines_are_said_to_be_left_out(tmp_path):
+def test_for_lines_there_is_a_warning(tmp_path):
     line = '</triangles><lines count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1</p></lines>'
     mesh = load_mesh(written(tmp_path, dae_text().replace("</triangles>", line)))
     assert mesh.warnings == ("1 sets of lines or curves left out, only triangles and polygons are drawn",)
 
 
-def test_a_controller_of_nothing_is_no_endless_loop(tmp_path):
+def test_a_controller_of_itself_makes_no_endless_loop(tmp_path):
     text = dae_text().replace("<library_visual_scenes>", CONTROLLER.replace('source="#g"', 'source="#c"'))
     text = text.replace('<instance_geometry url="#g">', '<instance_controller url="#c">')
     with pytest.raises(MeshError, match="found none"):
@@ -76,7 +76,7 @@ def test_a_controller_of_nothing_is_no_endless_loop(tmp_path):
          "</transparency>", 1.0),
     ],
 )  # fmt: skip
-def test_what_lets_light_through_is_drawn_opaque_and_said(tmp_path, inside, opacity):
+def test_transparency_is_drawn_opaque_with_a_warning(tmp_path, inside, opacity):
     """ "Determining Transparency" in the specification of COLLADA 1.4.1."""
     mesh = load_mesh(written(tmp_path, dae_text().replace("</diffuse></lambert>", f"</diffuse>{inside}</lambert>")))
     said = (f"effect 'e': drawn opaque, its opacity of {opacity:g} left out",)

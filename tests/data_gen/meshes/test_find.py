@@ -1,4 +1,4 @@
-"""Source of truth: folders of empty files, of which a person sees at once how many objects they hold."""
+"""Source of truth: folders of empty files with a known number of objects."""
 
 import pytest
 
@@ -19,7 +19,7 @@ def taken(root, **keywords):
     return [mesh.path.relative_to(root).as_posix() for mesh in find_meshes(root, **keywords).meshes]
 
 
-def test_files_of_one_name_are_one_object_and_the_best_format_is_taken(tmp_path):
+def test_files_of_one_name_are_one_object_in_the_best_format(tmp_path):
     touch(tmp_path, "a.glb", "a.obj", "a.fbx", "b.stl", "b.PLY", "c/b.off", "d.fbx", "d.blend")
     found = find_meshes(tmp_path)
     assert [mesh.path.name for mesh in found.meshes] == ["a.glb", "b.PLY", "b.off"]
@@ -40,25 +40,25 @@ def test_files_of_one_name_are_one_object_and_the_best_format_is_taken(tmp_path)
         (("x.blend", "exports/x.fbx", "stl/x.stl", "ply files/x.ply"), "ply files/x.ply"),
     ],
 )
-def test_folders_that_are_named_after_formats_hold_the_same_objects(tmp_path, folders, best):
+def test_folders_named_after_formats_have_the_same_objects(tmp_path, folders, best):
     touch(tmp_path, *folders, *(name.replace("x.", "y.") for name in folders))
     assert taken(tmp_path) == [best, best.replace("x.", "y.")]
 
 
-def test_other_folders_hold_other_objects(tmp_path):
+def test_other_folders_have_other_objects(tmp_path):
     names = ["obj_chairs/x.obj", "obj_tables/x.obj", "plywood/x.ply", "office/x.glb", "stlouis/x.stl", "x.off"]
-    names += ["max/part.stl", "ma/part.stl", "part.stl", "step/part.stl"]  # of programs, and of other files than these
+    names += ["max/part.stl", "ma/part.stl", "part.stl", "step/part.stl"]  # folders of programs and of other formats
     names += ["y.obj", "obj/y.obj"]  # two files of one format
     names += ["a/z.obj", "a/a/z.obj"]
     assert sorted(taken(touch(tmp_path, *names))) == sorted(names)
 
 
-def test_a_dot_within_a_name_begins_no_ending(tmp_path):
+def test_a_dot_in_a_name_does_not_begin_the_suffix(tmp_path):
     touch(tmp_path, "a.obj", "OBJ/a.v2.obj", "PLY/a.v2.ply", "b.v2.obj", "OBJ/b.v2.obj")
     assert sorted(taken(tmp_path)) == ["OBJ/a.v2.obj", "OBJ/b.v2.obj", "a.obj", "b.v2.obj"]
 
 
-def test_no_object_is_trained_on_in_one_format_and_tested_in_another(tmp_path):
+def test_an_object_in_several_formats_is_in_one_split(tmp_path):
     objects = ("chair", "desk", "lamp", "sofa", "table")
     kinds = {"DAE format": "dae", "GLTF format": "glb", "OBJ format": "obj"}
     touch(tmp_path, *(f"Models/{folder}/{name}.{kind}" for folder, kind in kinds.items() for name in objects))
@@ -70,7 +70,7 @@ def test_no_object_is_trained_on_in_one_format_and_tested_in_another(tmp_path):
     assert len(listing.duplicates) == 10
 
 
-def test_names_in_other_letters_differ_and_do_not_depend_on_their_neighbours(tmp_path):
+def test_names_in_other_scripts_differ_and_do_not_depend_on_other_files(tmp_path):
     texts = ("椅子", "机", "стул", "стол", "Stuhl", "Stühle", "が", "か")
     touch(tmp_path, *(f"{text}.glb" for text in texts))
     names = {mesh.path.stem: mesh.name for mesh in find_meshes(tmp_path).meshes}
@@ -82,7 +82,7 @@ def test_names_in_other_letters_differ_and_do_not_depend_on_their_neighbours(tmp
     assert {mesh.path.stem: mesh.name for mesh in find_meshes(tmp_path).meshes} == names
 
 
-def test_linked_folders_are_looked_into_and_each_folder_once(tmp_path):
+def test_linked_folders_are_searched_and_each_folder_once(tmp_path):
     touch(tmp_path / "elsewhere", "a/x.obj", "b/y.obj")
     root = touch(tmp_path / "meshes", "kept/z.obj")
     (root / "linked").symlink_to(tmp_path / "elsewhere/a")
@@ -93,7 +93,7 @@ def test_linked_folders_are_looked_into_and_each_folder_once(tmp_path):
     assert taken(root) == ["again/a/x.obj", "again/b/y.obj", "kept/z.obj"]
 
 
-def test_the_mesh_in_a_linked_folder_may_lie_outside_and_reads_what_is_beside_it(tmp_path):
+def test_the_mesh_in_a_linked_folder_may_be_outside_and_reads_the_files_next_to_it(tmp_path):
     folder = touch(tmp_path / "elsewhere/tree")
     folder.mkdir(parents=True)
     (folder / "x.obj").write_text("mtllib x.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 1\nusemtl paint\nf 1 2 3\n")

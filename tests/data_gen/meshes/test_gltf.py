@@ -1,6 +1,6 @@
-"""Source of truth: the glTF 2.0 specification and its extensions, on files of a few faces, and Khronos' samples.
+"""Source of truth: the glTF 2.0 specification and its extensions, for files of a few faces, and Khronos' samples.
 
-The samples show a tick where a viewer draws them right and a cross where it does not. They are not part of the project.
+The samples show a tick if a viewer draws them correctly, or else a cross. They are not part of the project.
 """
 
 import io
@@ -24,7 +24,7 @@ from hyperplanes.utilities.colour import linear_from_srgb
 KHRONOS = Path(__file__).parents[3] / ".." / "shared" / "meshes" / "khronos"
 SHEET = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float32)
 SHEET_FACES = [[0, 1, 2], [0, 2, 3]]
-SHEET_UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], dtype=np.float32)  # v downwards: the picture upright
+SHEET_UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], dtype=np.float32)  # v points down, so that the picture is upright
 
 
 @pytest.fixture(params=["pyrender-egl", "embree"])
@@ -35,7 +35,7 @@ def backend(request):
 
 
 def quarters():
-    """A picture of four colours: red and green above, blue and white below."""
+    """A picture of four colours: red and green at the top, blue and white at the bottom."""
     stream = io.BytesIO()
     texels = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], dtype=np.uint8)
     PIL.Image.fromarray(texels.repeat(16, axis=0).repeat(16, axis=1)).save(stream, "PNG")
@@ -43,7 +43,7 @@ def quarters():
 
 
 def draw(mesh, backend="embree", size=64):
-    """RGBA of a mesh from the front, unlit or lit from behind the camera."""
+    """RGBA of a mesh from the front, unlit or with a light behind the camera."""
     rig = orbit(1, size, elevation=0.0)
     return MeshRenderer(backend).render(mesh_parts(mesh), rig, lighting="headlight").rgba[0].astype(int)
 
@@ -61,7 +61,7 @@ def sheet(path, *, uv=SHEET_UV, change=None, image=None, **keywords):
 
 
 def at(pictured, u, v):
-    """The colour at a place of the square, (0, 0) its upper left corner."""
+    """The colour at a position in the square, whose upper left corner is (0, 0)."""
     rows, columns = np.nonzero(pictured[..., 3] == 255)
     row = rows.min() + v * np.ptp(rows)
     column = columns.min() + u * np.ptp(columns)
@@ -81,7 +81,7 @@ def test_unlit_is_the_colour_of_the_texture_whatever_the_light(tmp_path, backend
     ("mode", "expected"),
     [(10497, [RED, GREEN, RED, GREEN]), (33071, [RED, GREEN, GREEN, GREEN]), (33648, [RED, GREEN, GREEN, RED])],
 )
-def test_textures_go_on_as_their_sampler_says(tmp_path, backend, mode, expected):
+def test_textures_are_wrapped_by_the_mode_of_their_sampler(tmp_path, backend, mode, expected):
     def change(header, _):
         header["samplers"] = [{"wrapS": mode}]
         header["textures"][0]["sampler"] = 0
@@ -90,8 +90,8 @@ def test_textures_go_on_as_their_sampler_says(tmp_path, backend, mode, expected)
     assert [at(found, u, 0.2) for u in (0.125, 0.375, 0.625, 0.875)] == expected
 
 
-def test_a_texture_transform_turns_about_the_origin_after_scaling_and_before_the_offset(tmp_path):
-    """offset [0, 1] and rotation pi/2 take (u, v) to (v, 1 - u): the picture is turned clockwise by a quarter."""
+def test_a_texture_transform_rotates_after_scaling_and_before_the_offset(tmp_path):
+    """Offset [0, 1] and rotation pi/2 map (u, v) to (v, 1 - u), which rotates the picture clockwise by 90 degrees."""
 
     def change(header, _):
         moved = {"KHR_texture_transform": {"offset": [0, 1], "rotation": np.pi / 2}}
@@ -112,7 +112,7 @@ def second_coordinates(header, buffer):
     return buffer + (np.array([1, 0]) + SHEET_UV * [-1, 1]).astype(np.float32).tobytes()
 
 
-def test_each_texture_takes_its_own_coordinates(tmp_path, backend):
+def test_each_texture_uses_its_own_coordinates(tmp_path, backend):
     def base(header, buffer):
         header["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
         return second_coordinates(header, buffer)
@@ -126,7 +126,7 @@ def test_each_texture_takes_its_own_coordinates(tmp_path, backend):
     found = draw(sheet(tmp_path / "a.glb", change=base), backend)
     assert [at(found, u, 0.2) for u in (0.2, 0.8)] == [GREEN, RED]
     found = draw(sheet(tmp_path / "b.glb", change=emissive), backend)
-    assert [at(found, u, 0.2) for u in (0.2, 0.8)] == [[1, 1, 0], [1, 1, 0]]  # the red of one, the green of the other
+    assert [at(found, u, 0.2) for u in (0.2, 0.8)] == [[1, 1, 0], [1, 1, 0]]  # red of one texture, green of the other
 
 
 def glows_by_other_coordinates(header, buffer):
@@ -143,7 +143,7 @@ def does_not_repeat(header, _):
 
 
 def painted_ball(kind):
-    """A ball in dark colours, of its vertices or its faces."""
+    """A ball with dark colours of its vertices or faces."""
     ball = trimesh.creation.icosphere(2)
     colours = np.random.default_rng(0).integers(0, 60, (len(getattr(ball, kind)), 4), dtype=np.uint8) | [0, 0, 0, 255]
     ball.visual = trimesh.visual.ColorVisuals(ball, **{f"{'vertex' if kind == 'vertices' else 'face'}_colors": colours})
@@ -163,19 +163,19 @@ MESHES = {
 
 
 @pytest.mark.parametrize("kind", MESHES)
-def test_the_exported_mesh_is_the_one_that_was_drawn(tmp_path, kind):
-    """Property: read again it gives the same picture, to the rounding of its single precision."""
+def test_the_exported_mesh_is_drawn_as_the_original(tmp_path, kind):
+    """Property: after export and import the picture is the same, except for rounding to single precision."""
     mesh = MESHES[kind](tmp_path)
     (tmp_path / "again.glb").write_bytes(exported(mesh.scene))
     again = load_mesh(tmp_path / "again.glb")
     assert again.warnings == ()
     difference = np.abs(draw(mesh) - draw(again))
-    assert difference.max() <= 16  # a sample on an edge may be on its other side
+    assert difference.max() <= 16  # samples on an edge may round to either side
     assert difference.mean() < 0.02
 
 
-def test_other_programs_draw_the_exported_mesh_alike(tmp_path):
-    # A reader of the specification alone: linear colours, opaque, seen from both sides, no metal.
+def test_other_programs_draw_the_exported_mesh_in_the_same_way(tmp_path):
+    # By the specification: linear colours, opaque, double-sided, not metallic.
     mesh = prepare_scene(trimesh.Scene(trimesh.creation.box()), "box")
     for made in (mesh, painted_ball("vertices"), load_mesh(write_obj(tmp_path, mtl="newmtl paint\nKd 0.5 0 1\n"))):
         tree, _ = header_and_buffer(exported(made.scene))
@@ -211,7 +211,7 @@ def test_vertex_colours_multiply_the_texture(tmp_path, backend):
     assert [at(found, u, v) for v in (0.2, 0.8) for u in (0.2, 0.8)] == [RED, [0, 0, 0], BLUE, [1, 0, 1]]
 
 
-def test_emissive_strength_multiplies_what_a_surface_emits(tmp_path):
+def test_emissive_strength_multiplies_the_emission(tmp_path):
     def change(header, _):
         material = header["materials"][0]
         material.update(emissiveFactor=[0.25, 0, 0], pbrMetallicRoughness={"baseColorFactor": [0, 0, 0, 1]})
@@ -220,8 +220,8 @@ def test_emissive_strength_multiplies_what_a_surface_emits(tmp_path):
     assert draw(sheet(tmp_path / "a.glb", change=change))[32, 32, 0] == 255
 
 
-def test_a_material_of_the_older_workflow_with_a_palette_has_the_colours_of_the_palette(tmp_path):
-    """Duck and BoxTextured of Khronos' first samples: trimesh took the numbers of the palette for grey."""
+def test_a_palette_texture_of_the_specular_workflow_has_the_colours_of_the_palette(tmp_path):
+    """As in Duck and BoxTextured of Khronos' first samples. trimesh reads indices of the palette as grey values."""
     stream = io.BytesIO()
     PIL.Image.open(io.BytesIO(quarters())).quantize(4).save(stream, "PNG")
     assert PIL.Image.open(io.BytesIO(stream.getvalue())).mode == "P"
@@ -234,7 +234,7 @@ def test_a_material_of_the_older_workflow_with_a_palette_has_the_colours_of_the_
     (part,) = mesh_parts(mesh)
     texels = np.asarray(part.visual.material.baseColorTexture)
     expected = np.asarray(PIL.Image.open(io.BytesIO(quarters())))
-    assert np.abs(texels.astype(int) - expected).max() <= 12  # a diffuse colour is scaled by 1 / 0.96 on the way
+    assert np.abs(texels.astype(int) - expected).max() <= 12  # diffuse colours are scaled by 1 / 0.96
 
 
 @pytest.mark.parametrize(("mode", "corners"), [(5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])
@@ -242,12 +242,12 @@ def test_strips_and_fans_are_the_same_two_triangles(tmp_path, mode, corners):
     mesh = load_mesh(write_glb(tmp_path / "a.glb", positions=SHEET, faces=corners, mode=mode))
     (part,) = mesh_parts(mesh)
     assert mesh.face_count == 2
-    assert part.area == pytest.approx(2.0)  # of a square whose corners are at distance 1
+    assert part.area == pytest.approx(2.0)  # a square with corners at distance 1
     assert np.allclose(part.face_normals, [0, 0, 1])
 
 
 def add(header, buffer, array, kind, component, **more):
-    """Another accessor with its buffer view: its number, and the longer buffer."""
+    """Add an accessor with its buffer view. Returns its index and the longer buffer."""
     data = np.ascontiguousarray(array).tobytes()
     header["bufferViews"].append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)})
     accessor = {"bufferView": len(header["bufferViews"]) - 1, "componentType": component, "count": len(array)}
@@ -258,13 +258,13 @@ def add(header, buffer, array, kind, component, **more):
 
 
 def points_in_file(mesh):
-    """Vertices of a mesh in the coordinates of its file."""
+    """The vertices of a mesh in the coordinates of its file."""
     world = np.concatenate([part.vertices for part in mesh_parts(mesh)])
     return (world - mesh.world_from_file[:3, 3]) @ np.linalg.inv(mesh.world_from_file[:3, :3]).T
 
 
 @pytest.mark.parametrize("where", ["mesh", "node"])
-def test_morph_targets_count_with_their_default_weights(tmp_path, where):
+def test_morph_targets_have_their_default_weights(tmp_path, where):
     header, buffer = gltf()
     shift = np.array([[0, 0, 0], [2, 0, 0], [0, 0, 0], [0, 0, 0]], dtype=np.float32)
     number, buffer = add(header, buffer, shift, "VEC3", 5126)
@@ -276,7 +276,7 @@ def test_morph_targets_count_with_their_default_weights(tmp_path, where):
     assert np.allclose(points_in_file(mesh), TETRAHEDRON + 0.5 * shift, atol=1e-6)
 
 
-def test_skinned_vertices_go_with_their_joints_and_not_with_their_node(tmp_path):
+def test_skinned_vertices_have_the_transform_of_their_joints_and_not_of_their_node(tmp_path):
     above = {"translation": [0, 3, 0], "scale": [2, 2, 2], "children": [2]}
     skinned = {"mesh": 0, "skin": 0, "translation": [9, 9, 9]}
     header, buffer = gltf(nodes=[skinned, above, {"translation": [1, 0, 0]}])
@@ -291,7 +291,7 @@ def test_skinned_vertices_go_with_their_joints_and_not_with_their_node(tmp_path)
     assert np.allclose(points_in_file(mesh), 2 * (TETRAHEDRON + [1, 0, 0]) + [0, 3, 0], atol=1e-6)
 
 
-def test_quantised_positions_are_scaled_by_their_largest_number(tmp_path):
+def test_normalised_integer_positions_are_divided_by_their_maximum(tmp_path):
     header, buffer = gltf()
     number, buffer = add(header, buffer, (TETRAHEDRON * 127).astype(np.int8), "VEC3", 5120, normalized=True)
     header["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = number
@@ -300,7 +300,7 @@ def test_quantised_positions_are_scaled_by_their_largest_number(tmp_path):
     assert np.allclose(points_in_file(load_mesh(tmp_path / "a.glb")), TETRAHEDRON, atol=1e-6)
 
 
-def test_sparse_accessors_change_some_items_of_others_or_of_zeros(tmp_path):
+def test_sparse_accessors_replace_items_of_a_buffer_or_of_zeros(tmp_path):
     def written(base, count=1):
         header, buffer = gltf()
         _, buffer = add(header, buffer, np.array([3], np.uint16), "SCALAR", 5123)
@@ -321,12 +321,12 @@ def test_sparse_accessors_change_some_items_of_others_or_of_zeros(tmp_path):
     expected[3] = [0, 0, 5]
     assert np.allclose(points_in_file(load_mesh(written(True))), expected, atol=1e-6)
     with pytest.raises(MeshError, match="no extent|without area|found none"):
-        load_mesh(written(False))  # three vertices at zero
+        load_mesh(written(False))  # three vertices are zero
     with pytest.raises(MeshError, match="sparse indices: expected 9 items"):
         load_mesh(written(True, count=9))
 
 
-def test_instances_are_drawn_each_in_its_place(tmp_path):
+def test_instances_are_drawn_with_their_transforms(tmp_path):
     places = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0]], dtype=np.float32)
     header, buffer = gltf()
     number, buffer = add(header, buffer, places, "VEC3", 5126)
@@ -337,8 +337,8 @@ def test_instances_are_drawn_each_in_its_place(tmp_path):
     assert np.allclose(points_in_file(mesh), np.concatenate([TETRAHEDRON + place for place in places]), atol=1e-5)
 
 
-def test_more_parts_than_can_be_drawn_in_minutes_are_refused_at_once(tmp_path, monkeypatch):
-    """Whether one node has too many instances or many nodes have a few each."""
+def test_too_many_parts_to_draw_are_refused_at_once(tmp_path, monkeypatch):
+    """One node with too many instances, and many nodes with a few each."""
 
     def written(instances, nodes=1):
         header, buffer = gltf(nodes=[{"mesh": 0} for _ in range(nodes)])
@@ -360,7 +360,7 @@ def test_more_parts_than_can_be_drawn_in_minutes_are_refused_at_once(tmp_path, m
 
 @pytest.mark.parametrize(("factor", "metallic", "opacity"), [(0.5, 0.0, 0.7), (0.5, 1.0, 1.0), (0.0, 0.0, 1.0)])
 def test_transmission_is_drawn_as_opacity_with_a_warning(tmp_path, factor, metallic, opacity):
-    """By hand: a dielectric of colour 0.6 lets 0.5 x 0.6 through, a metal nothing."""
+    """By hand: a dielectric of colour 0.6 transmits 0.5 x 0.6 of the light, and a metal none."""
     material = {
         "pbrMetallicRoughness": {"baseColorFactor": [0.6, 0.6, 0.6, 1.0], "metallicFactor": metallic},
         "extensions": {"KHR_materials_transmission": {"transmissionFactor": factor}},
@@ -371,7 +371,7 @@ def test_transmission_is_drawn_as_opacity_with_a_warning(tmp_path, factor, metal
     assert any("KHR_materials_transmission drawn as opacity 0.70" in said for said in mesh.warnings) == (opacity < 1)
 
 
-def test_geometry_that_draco_compressed_is_read_or_its_package_named(tmp_path, monkeypatch):
+def test_geometry_compressed_by_draco_is_read_or_the_missing_package_named(tmp_path, monkeypatch):
     draco = pytest.importorskip("DracoPy", reason="DracoPy is not installed")
     header, buffer = gltf()
     block = draco.encode(TETRAHEDRON, faces=TETRAHEDRON_FACES, preserve_order=True, quantization_bits=16)
@@ -405,7 +405,7 @@ def test_a_missing_buffer_is_named(tmp_path):
         load_mesh(path)
 
 
-def test_a_node_under_two_parents_is_drawn_once_and_said(tmp_path):
+def test_a_node_with_two_parents_is_drawn_once_with_a_warning(tmp_path):
     nodes = [{"children": [2]}, {"children": [2]}, {"mesh": 0}]
     header, buffer = gltf(nodes=nodes)
     header["scenes"] = [{"nodes": [0, 1]}]

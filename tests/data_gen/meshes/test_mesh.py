@@ -1,4 +1,4 @@
-"""Source of truth: files written byte by byte (mesh_writers.py), whose geometry and colours are known."""
+"""Source of truth: files written byte by byte (mesh_writers.py), with known geometry and colours."""
 
 import subprocess
 import sys
@@ -33,7 +33,7 @@ from data_gen.rendering.surfaces import shaded_surfaces
 
 SHARED = Path(__file__).parents[3] / ".." / "shared" / "meshes"
 
-# Bounding box of the tetrahedron: the unit cube; its centre (.5, .5, .5), and all four vertices sqrt(3)/2 from it.
+# The bounding box of the tetrahedron is the unit cube. All four vertices are sqrt(3) / 2 from its centre.
 RADIUS = np.sqrt(3) / 2
 
 
@@ -53,12 +53,12 @@ def write_any(folder, kind):
 
 
 def corners(mesh):
-    """Corners of all faces in the world, in the order of the file."""
+    """The corners of all faces in world coordinates, in the order of the file."""
     return np.concatenate([part.vertices[part.faces] for part in mesh_parts(mesh)])
 
 
 def colour(part):
-    """The base colour of a part, linear RGBA from 0 to 255."""
+    """The base colour of a part, as linear RGBA from 0 to 255."""
     return np.asarray(part.visual.material.baseColorFactor).tolist()
 
 
@@ -91,7 +91,7 @@ def test_the_normalising_transform_is_recorded(tmp_path):
     assert np.allclose(linear @ linear.T, np.eye(3), atol=1e-6)
 
 
-def test_z_up_is_turned_to_y_up(tmp_path):
+def test_z_up_is_rotated_to_y_up(tmp_path):
     tall = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 9]], dtype=np.float32)
     path = write_glb(tmp_path / "a.glb", positions=tall)
     upright = load_mesh(path, up="z")
@@ -105,7 +105,7 @@ def test_z_up_is_turned_to_y_up(tmp_path):
         load_mesh(path, up="x")
 
 
-def test_node_transforms_and_instances_are_baked(tmp_path):
+def test_node_transforms_are_applied_to_vertices_also_of_instances(tmp_path):
     nodes = [{"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0], "scale": [2, 2, 2]}]
     mesh = load_mesh(write_glb(tmp_path / "a.glb", nodes=nodes))
     parts = sorted(mesh_parts(mesh), key=lambda part: part.scale)
@@ -116,7 +116,7 @@ def test_node_transforms_and_instances_are_baked(tmp_path):
 
 
 def test_normals_follow_a_stretching_transform(tmp_path):
-    # A plane x + y = const stretched by 4 along x has the normal (1/4, 1, 0).
+    # A plane x + y = const that is stretched by 4 along x has the normal (1/4, 1, 0).
     points = [[1, 0, 0], [0, 1, 0], [0, 1, 1], [1, 0, 1]]
     normal = np.array([[np.sqrt(0.5), np.sqrt(0.5), 0]] * 4)
     nodes = [{"mesh": 0, "scale": [4, 1, 1]}]
@@ -126,9 +126,9 @@ def test_normals_follow_a_stretching_transform(tmp_path):
     assert np.allclose(part.vertex_normals, np.array([0.25, 1, 0]) / np.hypot(0.25, 1), atol=1e-6)
 
 
-def test_obj_colours_are_made_linear_and_a_texture_takes_their_place(tmp_path):
+def test_obj_colours_are_converted_to_linear_and_replaced_by_a_texture(tmp_path):
     # sRGB 188 / 255 is linear 128 / 255.
-    # sRGB 0.1 is linear ((0.1 + 0.055) / 1.055)^2.4, which 8 bits would round to 3 / 255.
+    # sRGB 0.1 is linear ((0.1 + 0.055) / 1.055)^2.4; in 8 bits it would be rounded to 3 / 255.
     plain = mesh_parts(load_mesh(write_obj(tmp_path, mtl="newmtl paint\nKd 0.737255 0 0.1\n")))[0]
     assert colour(plain) == [128, 0, 3, 255]
     assert plain.copy().visual.material.exact[2] == pytest.approx(((0.1 + 0.055) / 1.055) ** 2.4, abs=1e-9)
@@ -155,13 +155,13 @@ def test_obj_polygons_relative_indices_tabs_and_several_libraries(tmp_path):
     assert colour(blue) == [0, 0, 255, 128]
 
 
-def test_obj_smoothing_groups_count_where_there_are_no_normals(tmp_path):
+def test_obj_smoothing_groups_are_used_without_normals(tmp_path):
     solid = OBJ_SOLID + "{}\n" + OBJ_FACES
     parts = [mesh_parts(load_mesh(write_obj(tmp_path, body=solid.format(line))))[0] for line in ("s 1", "s off")]
     assert [part.metadata["smooth"] for part in parts] == [True, False]
 
 
-def test_without_normals_round_things_are_smooth_and_hard_things_flat():
+def test_without_normals_round_objects_are_smooth_and_angular_ones_flat():
     shapes = {"ball": trimesh.creation.icosphere(subdivisions=3), "box": trimesh.creation.box()}
     parts = {name: mesh_parts(prepare_scene(trimesh.Scene(shape), name))[0] for name, shape in shapes.items()}
     assert {name: part.metadata["smooth"] for name, part in parts.items()} == {"ball": True, "box": False}
@@ -179,7 +179,7 @@ def test_vertex_colours_stay_srgb(tmp_path):
     assert np.array_equal(part.visual.vertex_colors[:, :3], [[255, 0, 0], [255, 0, 0], [0, 0, 255]])
 
 
-def test_gltf_vertex_colours_are_linear_and_tinted_by_the_material(tmp_path):
+def test_gltf_vertex_colours_are_linear_and_multiplied_by_the_material(tmp_path):
     # "an additional linear multiplier to base color" (glTF 2.0, 3.9.2), of a material that stays as it is
     painted = np.array([[0.50196, 0.50196, 1, 1]] * 4)
     material = {"pbrMetallicRoughness": {"baseColorFactor": [0.0018, 0, 1, 1], "roughnessFactor": 0.25}}
@@ -215,7 +215,7 @@ def test_dark_gltf_vertex_colours_are_as_exact_as_the_file(tmp_path, kind, mater
     np.testing.assert_allclose(surface.base_colour * surface.colours, [dark[0]] * len(surface.colours), atol=1e-5)
 
 
-def test_the_alpha_of_gltf_vertex_colours_counts_where_the_material_cuts_by_it(tmp_path):
+def test_the_alpha_of_gltf_vertex_colours_is_used_with_an_alpha_cutoff(tmp_path):
     painted = np.array([[1, 1, 1, 0.6]] * 4)
     for cutoff in (0.5, 0.7):
         material = {"alphaMode": "MASK", "alphaCutoff": cutoff}
@@ -234,7 +234,7 @@ def test_gltf_without_normals_is_flat(tmp_path):
 
 
 def test_the_vertex_colours_of_an_obj_have_one_range(tmp_path):
-    """Three of the six are 1 at most: of 255, as the others say."""
+    """Three of the six are at most 1, but the range is 0 to 255, as in the others."""
     points = [(0, 0, 0, 255, 0, 0), (1, 0, 0, 0, 200, 0), (0, 1, 0, 0, 0, 9), (0, 0, 1, 0, 0, 1), (1, 0, 1, 1, 0, 0)]
     body = "".join(f"v {' '.join(map(str, each))}\n" for each in [*points, (0, 1, 1, 0, 1, 0)])
     parts = mesh_parts(load_mesh(write_obj(tmp_path, body=body + "o a\nf 1 2 3\no b\nusemtl none\nf 4 5 6\n")))
@@ -260,7 +260,7 @@ def test_colours_of_ply_faces_are_kept(tmp_path):
     + [("float", "<f4", 0.502, 1.0), ("float", "<f4", 128.0, 255.0), ("double", "<f8", 128.0, 255.0)],
 )
 def test_colours_of_ply_files_have_the_range_of_their_type(tmp_path, element, binary, kind, dtype, half, white):
-    # 128 of 255 whether it is written as that, as 0.502 of 1 or as 32900 of 65535
+    # 128 of 255, 0.502 of 1 and 32900 of 65535 are the same colour
     dtypes = {"vertex": [("at", "<f4", 3)], "face": [("count", "u1"), ("corners", "<i4", 3)]}
     dtypes[element] = [*dtypes[element], ("colour", dtype, 3)]
     vertices, faces = (np.zeros(4, dtype=dtypes[name]) for name in ("vertex", "face"))
@@ -283,7 +283,7 @@ def test_colours_of_ply_files_have_the_range_of_their_type(tmp_path, element, bi
     assert np.array_equal(getattr(visual, f"{element}_colors"), [[128, 0, 255, 255]] * 4)
 
 
-def test_colours_of_off_files_that_are_left_out_are_named(tmp_path):
+def test_colours_of_off_files_are_ignored_with_a_warning(tmp_path):
     path = tmp_path / "a.off"
     path.write_text(off_text(vertex_tail=" 255 0 0"))
     assert load_mesh(path).warnings == ("3 numbers behind each vertex left out: colours need COFF on the first line",)
@@ -293,7 +293,7 @@ def test_colours_of_off_files_that_are_left_out_are_named(tmp_path):
     )
 
 
-def test_a_prepared_scene_survives_its_own_export(tmp_path):
+def test_a_prepared_scene_is_the_same_after_export_and_import(tmp_path):
     mesh = load_mesh(write_glb(tmp_path / "a.glb", nodes=[{"mesh": 0}, {"mesh": 0, "scale": [-2, 2, 2]}]))
     mesh.scene.export(tmp_path / "b.glb")
     again = load_mesh(tmp_path / "b.glb")
@@ -330,17 +330,17 @@ def test_gltf_materials_keep_their_factors_textures_and_alpha_mode(tmp_path):
     assert kept.baseColorTexture.getpixel((0, 0)) == (1, 2, 3, 200)
 
 
-def test_collada_turns_as_it_declares_and_finds_its_texture(tmp_path):
+def test_collada_has_its_declared_up_axis_and_finds_its_texture(tmp_path):
     path = tmp_path / "a.dae"
     path.write_text(dae_text(up="Z_UP"))
     mesh = load_mesh(path)
     assert mesh.warnings == ()
     assert np.allclose(mesh.world_from_file[:3, :3] @ [0, 0, 1] * RADIUS, [0, 1, 0])
-    # Its 0.5 is sRGB 128, linear 55.
+    # 0.5 is 128 in sRGB and 55 in linear light.
     assert colour(mesh_parts(mesh)[0]) == [255, 55, 0, 255]
 
 
-def test_a_prepared_scene_leaves_the_given_one_alone():
+def test_preparing_a_scene_does_not_change_the_given_one():
     box = trimesh.creation.box(extents=(4, 4, 4))
     box.visual = trimesh.visual.TextureVisuals(
         material=trimesh.visual.material.PBRMaterial(baseColorFactor=[10, 20, 30, 255], metallicFactor=0.0)
@@ -387,7 +387,7 @@ def test_importing_the_package_loads_no_mesh_library():
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real meshes of ../shared/meshes are not here")
-def test_all_real_meshes_load_with_their_losses_named():
+def test_all_real_meshes_load_with_warnings_about_losses():
     outcomes = {}
     for file in find_meshes(SHARED).meshes:
         try:
@@ -408,8 +408,8 @@ def test_all_real_meshes_load_with_their_losses_named():
     assert outcomes["messy_teapot_quads_no_mtl"] == ""
 
 
-def test_a_jpeg_with_further_pictures_behind_the_first_is_a_texture(tmp_path):
-    """Phones write them (CIPA's multi-picture format); the first one is an ordinary JPEG."""
+def test_a_jpeg_with_several_pictures_is_a_texture(tmp_path):
+    """Phones write CIPA's multi-picture format, in which the first picture is a common JPEG."""
     one, other = (PIL.Image.new("RGB", (8, 8), colour) for colour in ("red", "blue"))
     one.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[other])
     with PIL.Image.open(tmp_path / "a.jpg") as image:

@@ -1,6 +1,6 @@
-"""Source of truth: files written byte by byte to hold one trap each, and the outcome stated for it.
+"""Source of truth: files written byte by byte with one difficulty each, and the stated outcome.
 
-Every outcome is one of three: drawn right, drawn with a warning that names what was lost, or refused with the reason.
+Each file is drawn correctly, drawn with a warning that names what was lost, or refused with a reason.
 """
 
 import base64
@@ -46,13 +46,13 @@ def only_part(mesh):
 
 
 def warning(mesh):
-    """The one warning of a mesh."""
+    """The only warning of a mesh."""
     (line,) = mesh.warnings
     return line
 
 
 def refusal(path, **keywords):
-    """The message with which a mesh is refused: one line that begins with its file."""
+    """The error message for a mesh: one line that begins with the name of the file."""
     with pytest.raises(MeshError) as caught:
         load_mesh(path, **keywords)
     message = str(caught.value)
@@ -64,7 +64,7 @@ def refusal(path, **keywords):
 
 
 def outwards(part):
-    """Volume by the divergence theorem: positive if the faces are wound outwards."""
+    """The volume by the divergence theorem, which is positive if the faces are oriented outwards."""
     return float(np.einsum("ij,ij->", part.triangles[:, 0], np.cross(part.triangles[:, 1], part.triangles[:, 2])) / 6)
 
 
@@ -72,7 +72,7 @@ def outwards(part):
 
 
 @pytest.mark.parametrize("scale", [[-1, 1, 1], [1, -2, 1], [-1, -1, -1]])
-def test_mirrored_nodes_keep_their_faces_outwards_and_their_normals_with_them(tmp_path, scale):
+def test_faces_and_normals_of_mirrored_nodes_stay_oriented_outwards(tmp_path, scale):
     away = TETRAHEDRON - 0.25
     path = write_glb(tmp_path / "a.glb", positions=TETRAHEDRON, normals=away, nodes=[{"mesh": 0, "scale": scale}])
     mesh = load_mesh(path)
@@ -83,7 +83,7 @@ def test_mirrored_nodes_keep_their_faces_outwards_and_their_normals_with_them(tm
     assert np.linalg.det(mesh.world_from_file[:3, :3]) > 0
 
 
-def test_nodes_without_extent_or_not_finite(tmp_path):
+def test_nodes_with_zero_scale_or_values_that_are_not_finite(tmp_path):
     nodes = [{"mesh": 0}, {"mesh": 0, "scale": [0, 0, 0]}]
     mesh = load_mesh(write_glb(tmp_path / "a.glb", nodes=nodes))
     assert mesh.face_count == 4
@@ -101,8 +101,8 @@ def test_grey_textures_with_alpha_become_rgba(tmp_path):
     assert (image.mode, image.getpixel((0, 0))) == ("RGBA", (50, 50, 50, 200))
 
 
-def test_the_opacity_of_an_obj_comes_from_map_d_and_d_alone(tmp_path):
-    """As in Blender: textures are often saved with an alpha channel that means something else."""
+def test_the_opacity_of_an_obj_comes_only_from_map_d_and_d(tmp_path):
+    """As in Blender, since alpha channels of textures often have another meaning."""
     (tmp_path / "mask.png").write_bytes(picture("L", size=(8, 8), colour=64))
 
     def texel(mtl):
@@ -159,7 +159,7 @@ def test_texture_coordinates_that_are_missing_or_not_finite_are_counted(tmp_path
     assert warning(mesh) == "solid: 1 texture coordinates are not finite; set to 0"
 
 
-def test_alpha_counts_only_where_the_material_says_so(tmp_path):
+def test_alpha_is_used_only_with_an_alpha_mode_of_the_material(tmp_path):
     clear = picture("RGBA", colour=(9, 9, 9, 0))
     opaque = only_part(load_mesh(write_glb(tmp_path / "a.glb", uv=SQUARE_UV, image=clear))).visual.material
     assert (opaque.baseColorTexture.mode, opaque.baseColorFactor[3]) == ("RGB", 255)
@@ -171,21 +171,21 @@ def test_alpha_counts_only_where_the_material_says_so(tmp_path):
 @pytest.mark.parametrize(
     ("mode", "factor", "alpha"), [("BLEND", 0.0, None), ("BLEND", 1.0, 0), ("MASK", 0.4, None), ("MASK", 1.0, 100)]
 )
-def test_what_is_fully_transparent_is_left_out_by_name_and_refused_alone(tmp_path, mode, factor, alpha):
+def test_fully_transparent_parts_are_omitted_by_name_and_refused_if_alone(tmp_path, mode, factor, alpha):
     material = {"alphaMode": mode, "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, factor]}}
     image = None if alpha is None else picture("RGBA", colour=(9, 9, 9, alpha))
     path = write_glb(tmp_path / "a.glb", uv=SQUARE_UV, material=material, image=image)
     assert "solid: fully transparent, left out" in refusal(path)
 
 
-def test_an_obj_with_one_invisible_material_says_which(tmp_path):
+def test_an_invisible_material_of_an_obj_is_named(tmp_path):
     body = OBJ_SOLID + "usemtl air\nf 1 3 2\nusemtl paint\nf 1 2 4\n"
     mesh = load_mesh(write_obj(tmp_path, mtl=PAINT + "newmtl air\nd 0\n", body=body))
     assert "air: fully transparent, left out" in mesh.warnings
     assert mesh.face_count == 1
 
 
-def test_vertex_colours_of_alpha_0_are_taken_as_opaque(tmp_path):
+def test_vertex_colours_of_alpha_0_are_drawn_opaque(tmp_path):
     (tmp_path / "a.ply").write_bytes(ply_bytes(colours=np.array([[1, 2, 3, 0]] * 4, dtype=np.uint8)))
     mesh = load_mesh(tmp_path / "a.ply")
     assert "every colour has alpha 0; taken as opaque" in warning(mesh)
@@ -213,7 +213,7 @@ def test_translucency_of_an_mtl_file(tmp_path):
         "model://chair/materials/wood.png",
     ],
 )
-def test_ways_to_write_a_texture_that_is_there(tmp_path, name):
+def test_names_of_an_existing_texture_may_be_written_in_several_ways(tmp_path, name):
     (tmp_path / "textures").mkdir()
     mesh = load_mesh(write_obj(tmp_path, mtl=PAINT + f"map_Kd {name}\n", texture=picture(colour=(5, 6, 7))))
     assert mesh.warnings == ()
@@ -221,7 +221,7 @@ def test_ways_to_write_a_texture_that_is_there(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["gone.png", "model://suv/materials/gone.png", "textures\\gone.png", "maps"])
-def test_an_absent_texture_is_named_with_its_material(tmp_path, name):
+def test_a_missing_texture_is_named_with_its_material(tmp_path, name):
     (tmp_path / "maps").mkdir()
     mesh = load_mesh(write_obj(tmp_path, mtl=PAINT + f"map_Kd {name}\n"))
     assert warning(mesh) == f"material 'paint': drawn without its texture {name} (not found)"
@@ -229,7 +229,7 @@ def test_an_absent_texture_is_named_with_its_material(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["/srv/art/wood.png", "C:\\art\\wood.png", "\\\\server\\art\\wood.png"])
-def test_an_absolute_path_is_not_followed_but_its_file_beside_the_mesh_is_taken(tmp_path, name):
+def test_for_an_absolute_path_the_file_of_that_name_next_to_the_mesh_is_read(tmp_path, name):
     mesh = load_mesh(write_obj(tmp_path, mtl=PAINT + f"map_Kd {name}\n", texture=picture(colour=(5, 6, 7))))
     assert warning(mesh) == f"{name}: absolute path not followed, wood.png taken"
     assert only_part(mesh).visual.material.baseColorTexture.getpixel((0, 0)) == (5, 6, 7)
@@ -245,7 +245,7 @@ def test_an_absolute_path_is_not_followed_but_its_file_beside_the_mesh_is_taken(
         ("suv", "C:\\art\\wood.png", "suv/textures"),
         ("suv", "maps/WOOD.PNG", "suv"),
         ("suv", "../shared/wood.png", "shared"),
-        ("suv/meshes", "../../../art/wood.png", "suv/materials/textures"),  # leaves all, and is here by its base name
+        ("suv/meshes", "../../../art/wood.png", "suv/materials/textures"),  # outside, but its base name is found
     ],
 )
 def test_textures_are_found_where_models_of_gazebo_and_others_keep_them(tmp_path, mesh_at, name, texture_at):
@@ -259,7 +259,7 @@ def test_textures_are_found_where_models_of_gazebo_and_others_keep_them(tmp_path
     assert all(line.endswith("wood.png taken") for line in mesh.warnings)
 
 
-def test_nothing_outside_the_folder_that_was_given_is_looked_at(tmp_path):
+def test_no_file_outside_the_given_folder_is_read(tmp_path):
     (tmp_path / "suv/meshes").mkdir(parents=True)
     (tmp_path / "suv/materials/textures").mkdir(parents=True)
     (tmp_path / "suv/materials/textures/wood.png").write_bytes(picture())
@@ -305,7 +305,7 @@ def test_textures_of_collada_and_ply_are_found_or_named(tmp_path):
     assert "wood.png" in "; ".join(load_mesh(tmp_path / "a.ply").warnings)
 
 
-def test_an_absent_or_empty_mtl_and_an_undefined_material_are_named(tmp_path):
+def test_a_missing_or_empty_mtl_and_an_undefined_material_are_named(tmp_path):
     body = "mtllib gone.mtl\n" + OBJ_SOLID + "usemtl paint\n" + OBJ_FACES
     lines = load_mesh(write_obj(tmp_path, body=body)).warnings
     assert lines == ("gone.mtl: not found", "material 'paint' is defined nowhere; drawn grey")
@@ -338,15 +338,15 @@ def test_unicode_names(tmp_path):
 # --- geometry -----------------------------------------------------------------------------------------------------
 
 
-def test_a_solid_wound_inside_out_is_turned(tmp_path):
+def test_a_solid_with_faces_oriented_inwards_is_reversed(tmp_path):
     path = write_glb(tmp_path / "a.glb", faces=TETRAHEDRON_FACES[:, ::-1])
     mesh = load_mesh(path)
     assert warning(mesh) == "solid: wound inside out, its faces are turned"
     assert outwards(only_part(mesh)) > 0
 
 
-def test_a_face_without_its_vertex_is_told_of_whichever_part_it_is_in():
-    """Each part is compared with the others, so those that come later must have been looked at before."""
+def test_a_face_with_a_missing_vertex_is_named_in_any_part():
+    """Each part is compared with the others, so that all parts must be checked before."""
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.Trimesh(TETRAHEDRON, TETRAHEDRON_FACES[:, ::-1], process=False), geom_name="whole")
     wrong = TETRAHEDRON_FACES.copy()
@@ -371,7 +371,7 @@ def test_normals_that_are_missing_zero_not_finite_or_inverted(tmp_path):
     assert load_mesh(write_glb(tmp_path / "c.glb")).warnings == ()
 
 
-def test_faces_without_area_are_left_out(tmp_path):
+def test_faces_without_area_are_omitted(tmp_path):
     faces = np.concatenate([TETRAHEDRON_FACES, [[0, 0, 1], [2, 2, 2]]])
     mesh = load_mesh(write_glb(tmp_path / "a.glb", faces=faces))
     assert mesh.face_count == 4
@@ -408,14 +408,14 @@ def test_no_extent_and_absurd_coordinates_are_refused(tmp_path, positions):
         refusal(path)
 
 
-def test_any_sane_scale_is_normalised(tmp_path):
+def test_meshes_of_any_reasonable_scale_are_normalised(tmp_path):
     for scale in (1e-7, 1e-3, 1e6, 1e20):
         path = write_glb(tmp_path / "a.glb", positions=TETRAHEDRON * np.float32(scale))
         assert only_part(load_mesh(path)).extents.tolist() == pytest.approx([2 / np.sqrt(3)] * 3, rel=1e-5)
 
 
 @pytest.mark.parametrize("scale", [2.0**-24, 2.0**-40, 2.0**24])
-def test_the_size_of_a_mesh_changes_nothing_of_its_repair(scale):
+def test_the_repair_of_a_mesh_does_not_depend_on_its_size(scale):
     ball, rod = trimesh.creation.icosphere(2), trimesh.creation.cylinder(0.01, 3.0)
     ball.invert()
     scene = trimesh.Scene([ball, rod])
@@ -429,7 +429,7 @@ def test_the_size_of_a_mesh_changes_nothing_of_its_repair(scale):
     assert np.array_equal(scaled.world_from_file[:3, :3] * scale, whole.world_from_file[:3, :3])
 
 
-def test_a_vertex_far_away_is_remarked(tmp_path):
+def test_for_a_distant_vertex_there_is_a_warning(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=1)
     points = np.concatenate([ball.vertices, [[1e4, 0, 0]]])
     faces = np.concatenate([ball.faces, [[0, 1, len(ball.vertices)]]])
@@ -448,7 +448,7 @@ def test_points_only_and_lines_only_are_refused(tmp_path):
         assert f"solid: {what} left out" in refusal(path)
 
 
-def test_lines_beside_faces_are_named(tmp_path):
+def test_for_lines_in_a_mesh_with_faces_there_is_a_warning(tmp_path):
     mesh = load_mesh(write_obj(tmp_path, body=OBJ_SOLID + OBJ_FACES + "l 1 2\nf 1 2\nwhat is this\n"))
     assert mesh.warnings == (
         "1 lines left out, only faces are drawn",
@@ -475,7 +475,7 @@ def test_other_files_are_refused(tmp_path):
     assert "found '.fbx'" in refusal(tmp_path / "a.fbx")
 
 
-def test_an_stl_and_a_gltf_with_nothing_in_them_are_refused(tmp_path):
+def test_an_empty_stl_and_an_empty_gltf_are_refused(tmp_path):
     (tmp_path / "a.stl").write_bytes(b"\0" * 84)
     assert "an STL with none" in refusal(tmp_path / "a.stl")
     refusal(write_glb(tmp_path / "a.glb", nodes=[{"name": "empty"}]))
@@ -486,7 +486,7 @@ def test_an_stl_and_a_gltf_with_nothing_in_them_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("head", [b"\0", b"solid"])
-def test_bytes_behind_the_last_triangle_of_an_stl_are_said_to_be_left_out(tmp_path, head):
+def test_for_bytes_after_the_last_triangle_of_an_stl_there_is_a_warning(tmp_path, head):
     path = tmp_path / "a.stl"
     path.write_bytes(head + stl_bytes()[len(head) :] + b"padding")
     mesh = load_mesh(path)
@@ -495,11 +495,11 @@ def test_bytes_behind_the_last_triangle_of_an_stl_are_said_to_be_left_out(tmp_pa
 
 
 @pytest.mark.parametrize("face", ["f 1 2 9", "f 0 1 2", "f 1 2 -9", "f 1 2 x", "f 1/1/1/1 2 3"])
-def test_obj_faces_on_vertices_that_are_not_there_are_refused(tmp_path, face):
+def test_obj_faces_with_missing_vertices_are_refused(tmp_path, face):
     assert "expected" in refusal(write_obj(tmp_path, body=OBJ_SOLID + face + "\n"))
 
 
-def test_faces_on_vertices_that_are_not_there_are_refused_everywhere(tmp_path):
+def test_faces_with_missing_vertices_are_refused_in_every_format(tmp_path):
     faces = TETRAHEDRON_FACES.copy()
     faces[2, 1] = 9
     refusal(write_glb(tmp_path / "a.glb", faces=faces))
@@ -509,7 +509,7 @@ def test_faces_on_vertices_that_are_not_there_are_refused_everywhere(tmp_path):
     refusal(tmp_path / "a.off")
 
 
-def test_too_many_faces_are_decimated_where_the_looks_survive(tmp_path):
+def test_too_many_faces_are_decimated_where_the_appearance_is_kept(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=4)
     mesh = prepare_scene(trimesh.Scene(ball.copy()), "ball", max_faces=2000)
     assert warning(mesh) == f"decimated from {len(ball.faces)} to {mesh.face_count} triangles"
@@ -529,7 +529,7 @@ def test_too_many_faces_are_decimated_where_the_looks_survive(tmp_path):
     assert (red == (part.vertices[:, 2] > 0))[np.abs(part.vertices[:, 2]) > 0.1].all()
 
 
-def test_too_many_faces_are_drawn_where_it_would_not_and_far_too_many_refused():
+def test_meshes_that_cannot_be_decimated_are_drawn_up_to_a_limit_of_faces():
     ball = trimesh.creation.icosphere(subdivisions=3)
     ball.visual.face_colors = np.random.default_rng(0).integers(0, 255, (len(ball.faces), 4), dtype=np.uint8)
     mesh = prepare_scene(trimesh.Scene(ball), "ball", max_faces=1000)
@@ -539,8 +539,8 @@ def test_too_many_faces_are_drawn_where_it_would_not_and_far_too_many_refused():
         prepare_scene(trimesh.Scene(ball), "ball", max_faces=100)
 
 
-def test_a_quarter_of_a_million_faces_are_drawn_as_they_are(tmp_path):
-    """Source of truth: the silhouette of a sphere that just fits."""
+def test_a_quarter_of_a_million_faces_are_drawn_unchanged(tmp_path):
+    """Source of truth: the silhouette of a sphere in closed form."""
     rows, columns = 257, 512
     polar, around = np.meshgrid(np.linspace(1e-3, np.pi - 1e-3, rows), np.arange(columns) * 2 * np.pi / columns)
     points = np.stack([np.sin(polar) * np.cos(around), np.cos(polar), np.sin(polar) * np.sin(around)], -1)
@@ -568,13 +568,13 @@ def test_a_quarter_of_a_million_faces_are_drawn_as_they_are(tmp_path):
         ("extensionsRequired", "ACME_rays", "export it without"),
     ],
 )
-def test_compressions_and_unknown_needs_are_refused_with_a_remedy(tmp_path, key, name, remedy):
+def test_compressions_and_unknown_required_extensions_are_refused_with_a_remedy(tmp_path, key, name, remedy):
     message = refusal(write_gltf(tmp_path, change=lambda header: header.update({key: [name]})))
     assert name in message
     assert remedy in message
 
 
-def test_what_a_gltf_asks_for_and_is_not_drawn_is_named(tmp_path):
+def test_unsupported_features_of_a_gltf_are_named(tmp_path):
     def change(header):
         header["extensionsUsed"] = ["KHR_materials_clearcoat", "KHR_materials_transmission"]
         header["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] = 0
@@ -589,7 +589,7 @@ def test_what_a_gltf_asks_for_and_is_not_drawn_is_named(tmp_path):
     )
 
 
-def test_a_lost_texture_leaves_grey_and_not_white(tmp_path):
+def test_a_material_with_a_missing_texture_is_grey_and_not_white(tmp_path):
     path = write_gltf(
         tmp_path,
         uv=SQUARE_UV,
@@ -631,7 +631,7 @@ def test_a_lost_texture_leaves_grey_and_not_white(tmp_path):
         lambda header: header.update(meshes=[None]),
     ],
 )
-def test_a_gltf_that_lies_about_itself_is_refused(tmp_path, change):
+def test_an_inconsistent_gltf_is_refused(tmp_path, change):
     refusal(write_gltf(tmp_path, change=change))
 
 
@@ -644,7 +644,7 @@ def test_a_buffer_inside_the_json_is_read(tmp_path):
     assert load_mesh(tmp_path / "a.gltf").face_count == 4
 
 
-def test_nodes_in_a_circle_and_deep_json_end(tmp_path):
+def test_cyclic_nodes_and_deep_json_are_refused(tmp_path):
     nodes = [{"children": [1]}, {"mesh": 0, "children": [0]}]
     path = write_glb(tmp_path / "a.glb", nodes=nodes)
     try:
@@ -660,7 +660,7 @@ def test_nodes_in_a_circle_and_deep_json_end(tmp_path):
 
 @pytest.fixture
 def model(tmp_path):
-    """A model's folder, beside which lies a file that it must not read."""
+    """The folder of a model, next to which is a file that must not be read."""
     (tmp_path / "secret.png").write_bytes(picture(colour=(1, 2, 3)))
     (tmp_path / "secret.mtl").write_text(PAINT)
     (tmp_path / "secret.bin").write_bytes(gltf()[1])
@@ -677,13 +677,13 @@ def test_references_that_leave_the_folder_are_refused_by_name(model, name):
     assert repr(name) in refusal(path)
 
 
-def test_the_folder_is_named_where_the_mesh_is_given_without_one(model, monkeypatch):
+def test_the_folder_is_named_if_the_mesh_is_given_without_one(model, monkeypatch):
     write_obj(model, mtl=PAINT + "map_Kd ../secret.png\n")
     monkeypatch.chdir(model)
     assert "mesh.obj: expected references inside model/, found '../secret.png'" in refusal("mesh.obj")
 
 
-def test_what_an_absolute_path_names_is_not_read(model):
+def test_files_of_absolute_paths_are_not_read(model):
     name = str(model.parent / "secret.png")
     mesh = load_mesh(write_obj(model, mtl=PAINT + f"map_Kd {name}\n"))
     assert warning(mesh) == f"material 'paint': drawn without its texture {name} (absolute path not followed)"
@@ -727,7 +727,7 @@ def test_decompression_bombs_are_refused_before_they_are_decoded(tmp_path, size)
     assert "wood" in refusal(write_glb(tmp_path / "a.glb", uv=SQUARE_UV, image=bomb))
 
 
-def test_many_textures_count_together(tmp_path, monkeypatch):
+def test_the_limit_of_pixels_is_for_all_textures_together(tmp_path, monkeypatch):
     mtl = "".join(f"newmtl m{index}\nmap_Kd {index}.png\n" for index in range(3))
     body = OBJ_SOLID + "".join(f"usemtl m{index}\nf 1/1 2/2 {3 + index % 2}/3\n" for index in range(3))
     for index in range(3):
@@ -761,7 +761,7 @@ def test_entities_of_xml_are_refused(tmp_path):
 
 
 def outcome(path, data):
-    """What becomes of a file of this content: the mesh, or None if it is refused; any other error fails the test."""
+    """The mesh of a file with this content, or None if it is refused. Any other error fails the test."""
     path.write_bytes(data)
     try:
         return load_mesh(path)
@@ -788,40 +788,40 @@ def test_a_gltf_or_its_buffer_cut_anywhere_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("kind", "binary"), [("ply", True), ("stl", True), ("ply", False), ("stl", False)])
-def test_a_ply_or_stl_cut_anywhere_is_refused_or_says_so(tmp_path, kind, binary):
+def test_a_ply_or_stl_cut_anywhere_is_refused_or_has_a_warning(tmp_path, kind, binary):
     data = {"ply": ply_bytes, "stl": stl_bytes}[kind](binary=binary)
     step = 1 if kind == "ply" else 3
     for length in range(0, len(data), step):
         mesh = outcome(tmp_path / f"a.{kind}", data[:length])
-        whole = data[length:].strip() in (b"", b"mesh", b"h", b"sh", b"esh")  # the name after endsolid
+        whole = data[length:].strip() in (b"", b"mesh", b"h", b"sh", b"esh")  # only the name after endsolid is cut
         assert mesh is None or mesh.warnings or whole, length
 
 
-def test_an_off_or_dae_cut_anywhere_is_refused_or_says_so(tmp_path):
+def test_an_off_or_dae_cut_anywhere_is_refused_or_has_a_warning(tmp_path):
     for kind, data in (("off", off_text().encode()), ("dae", dae_text().encode())):
         for length in range(0, len(data), 1 if kind == "off" else 97):
             mesh = outcome(tmp_path / f"a.{kind}", data[:length])
             assert mesh is None or mesh.warnings or not data[length:].strip(), (kind, length)
 
 
-def test_an_obj_cut_anywhere_is_refused_or_says_so_but_between_its_last_lines(tmp_path):
+def test_an_obj_cut_before_its_last_lines_is_refused_or_has_a_warning(tmp_path):
     write_obj(tmp_path, mtl=WOOD, texture=picture())
     path = tmp_path / "mesh.obj"
     data = path.read_bytes()
     silent = [length for length in range(len(data)) if (mesh := outcome(path, data[:length])) and not mesh.warnings]
-    # Known limit: after the second face all four vertices are used, and a file that ends with a line is whole.
+    # Known limit: after the second face all four vertices are used, so that a file cut after a line is valid.
     ends = [index + 1 for index, byte in enumerate(data) if byte == 10]
     assert silent == ends[-3:-1]
 
 
-def test_an_mtl_cut_anywhere_never_fails_otherwise(tmp_path):
+def test_an_mtl_cut_anywhere_raises_no_other_error(tmp_path):
     path = write_obj(tmp_path, mtl=WOOD, texture=picture())
     for length in range(len(WOOD)):
         (tmp_path / "mesh.mtl").write_text(WOOD[:length])
         assert outcome(path, path.read_bytes()) is not None
 
 
-def test_bytes_changed_at_random_never_fail_otherwise(tmp_path):
+def test_random_bytes_raise_no_other_error(tmp_path):
     generator = np.random.default_rng(0)
     files = {
         "a.glb": glb_bytes(*gltf(uv=SQUARE_UV, image=picture())),

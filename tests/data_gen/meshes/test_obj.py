@@ -1,4 +1,4 @@
-"""Source of truth: the OBJ and MTL format (Wavefront, appendix B1), on files of a few lines."""
+"""Source of truth: the OBJ and MTL formats (Wavefront, appendix B1), for files of a few lines."""
 
 import io
 
@@ -21,7 +21,7 @@ def only_part(mesh):
 
 
 def cube(*, groups, uv=False):
-    """A cube of six quadrilaterals: in one smoothing group or in six, its texture taken apart at every edge or not."""
+    """A cube of six quadrilaterals, with one smoothing group or six, and with or without texture seams at each edge."""
     box = trimesh.creation.box()
     lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + [f"vt {u} {v}" for u in (0, 1) for v in (0, 1)]
     lines += ["usemtl paint"]
@@ -40,7 +40,7 @@ def test_errors_name_the_first_line_of_a_continued_statement(tmp_path):
             load_mesh(write_obj(tmp_path, body=OBJ_SOLID + body))
 
 
-def test_smoothing_groups_are_apart_from_each_other(tmp_path):
+def test_normals_are_not_smoothed_across_smoothing_groups(tmp_path):
     def against_faces(body):
         part = only_part(load_mesh(write_obj(tmp_path, mtl=PAINT, body=body)))
         normals = part.vertex_normals[part.faces]
@@ -51,8 +51,8 @@ def test_smoothing_groups_are_apart_from_each_other(tmp_path):
     assert against_faces(cube(groups=True, uv=True)) == pytest.approx(1.0)
 
 
-def test_a_seam_of_the_texture_is_no_edge_of_the_surface(tmp_path):
-    """A ball whose every face has coordinates of its own is shaded as one without a texture."""
+def test_normals_are_smoothed_across_texture_seams(tmp_path):
+    """A ball with separate texture coordinates for each face is shaded as one without a texture."""
     ball = trimesh.creation.icosphere(2)
     rows = "".join(f"v {x} {y} {z}\n" for x, y, z in ball.vertices)
     rows += "".join(f"vt {index % 7} {index % 5}\n" for index in range(3 * len(ball.faces))) + "usemtl paint\n"
@@ -69,7 +69,7 @@ def test_a_seam_of_the_texture_is_no_edge_of_the_surface(tmp_path):
 @pytest.mark.parametrize(
     ("newline", "encoding"), [("\r", "utf-8"), ("\r\n", "utf-16"), ("\n", "utf-16-be"), ("\r", "latin-1")]
 )
-def test_lines_end_and_letters_are_written_as_on_any_system(tmp_path, newline, encoding):
+def test_line_endings_and_encodings_of_any_system_are_read(tmp_path, newline, encoding):
     text = "mtllib mesh.mtl\n# Möbel\n" + OBJ_SOLID + "usemtl größe\n" + OBJ_FACES
     mark = b"\xfe\xff" if encoding == "utf-16-be" else b""
     (tmp_path / "a.obj").write_bytes(mark + text.replace("\n", newline).encode(encoding))
@@ -79,7 +79,7 @@ def test_lines_end_and_letters_are_written_as_on_any_system(tmp_path, newline, e
     assert only_part(mesh).visual.material.baseColorFactor.tolist() == [255, 0, 0, 255]
 
 
-def test_options_of_a_texture_move_it(tmp_path):
+def test_options_of_a_texture_move_and_scale_it(tmp_path):
     path = write_obj(tmp_path, mtl=PAINT + "map_Kd -clamp on -s 2 3 1 -o 0.5 0.25 0 wood.png\n", texture=picture())
     part = only_part(load_mesh(path))
     (tmp_path / "plain").mkdir()
@@ -89,7 +89,7 @@ def test_options_of_a_texture_move_it(tmp_path):
     assert plain.visual.material.wrap == ("repeat", "repeat")
 
 
-def test_a_glow_map_glows_and_a_lost_one_leaves_no_glow(tmp_path):
+def test_an_emission_map_is_used_and_a_missing_one_leaves_no_emission(tmp_path):
     mtl = PAINT + "Ke 1 0.5 0\nmap_Ke glow.png\n"
     mesh = load_mesh(write_obj(tmp_path, mtl=mtl))
     assert mesh.warnings == ("material 'paint': drawn without its glow and its map glow.png (not found)",)
@@ -108,7 +108,7 @@ def test_an_absolute_path_without_its_file_draws_the_plain_colour(tmp_path, name
 
 
 @pytest.mark.parametrize("page", ["latin-1", "cp437", "cp932"])
-def test_textures_are_found_whatever_code_page_named_them(tmp_path, page):
+def test_textures_are_found_for_names_in_any_code_page(tmp_path, page):
     name = "椅子.png" if page == "cp932" else "Möbel.png"
     (tmp_path / "maps").mkdir()
     (tmp_path / "maps" / name).write_bytes(picture(colour=(5, 6, 7)))
@@ -119,7 +119,7 @@ def test_textures_are_found_whatever_code_page_named_them(tmp_path, page):
     assert mesh.lost_files == ()
 
 
-def test_comments_behind_statements_are_no_part_of_them(tmp_path):
+def test_comments_after_statements_are_ignored(tmp_path):
     body = OBJ_SOLID + "s off # flat\nusemtl paint # red\n" + OBJ_FACES.replace("\n", " # a face\n")
     path = write_obj(tmp_path, body="mtllib mesh.mtl # materials\n" + body, texture=picture(colour=(5, 6, 7)))
     (tmp_path / "mesh.mtl").write_text("newmtl paint # red\nKd 0.5 # grey\nmap_Kd wood.png # oak\n")
@@ -140,7 +140,7 @@ def test_comments_behind_statements_are_no_part_of_them(tmp_path):
         ("Material #27", "Material #26\nnewmtl Material #25\nKd 1 0 0", False),
     ],
 )
-def test_a_name_may_hold_what_looks_like_a_comment(tmp_path, used, defined, red):
+def test_a_name_may_contain_the_sign_of_a_comment(tmp_path, used, defined, red):
     mtl = "newmtl " + defined + ("\nKd 1 0 0\n" if "Kd" not in defined else "\n")
     mesh = load_mesh(write_obj(tmp_path, mtl=mtl, body=OBJ_SOLID + f"usemtl {used}\n" + OBJ_FACES))
     assert (only_part(mesh).visual.material.baseColorFactor.tolist() == [255, 0, 0, 255]) == red
@@ -152,7 +152,7 @@ def test_vertices_of_lines_are_not_a_sign_of_a_cut_file(tmp_path):
     assert load_mesh(write_obj(tmp_path, body=body)).warnings == ("1 lines left out, only faces are drawn",)
 
 
-def test_a_mesh_that_would_take_minutes_is_refused_at_once(tmp_path, monkeypatch):
+def test_a_mesh_that_is_too_large_is_refused_at_once(tmp_path, monkeypatch):
     body = OBJ_SOLID + OBJ_FACES
     libraries = "".join(f"mtllib {index}.mtl\n" for index in range(MAX_LIBRARIES + 1))
     with pytest.raises(MeshError, match=f"at most {MAX_LIBRARIES} material libraries, found {MAX_LIBRARIES + 1}"):
@@ -164,7 +164,7 @@ def test_a_mesh_that_would_take_minutes_is_refused_at_once(tmp_path, monkeypatch
         load_mesh(write_obj(tmp_path, mtl=mtl))
 
 
-def test_pictures_of_any_mode_glow(tmp_path):
+def test_emission_maps_may_have_any_mode(tmp_path):
     stream = io.BytesIO()
     PIL.Image.new("P", (2, 2)).save(stream, "PNG")
     (tmp_path / "glow.png").write_bytes(stream.getvalue())

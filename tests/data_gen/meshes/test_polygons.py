@@ -1,4 +1,4 @@
-"""Source of truth: the area of polygons by the shoelace formula, and that triangles are wound as their polygon."""
+"""Source of truth: areas of polygons by the shoelace formula. Triangles have the orientation of their polygon."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from data_gen.meshes.triangulate import triangulate
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 DART = np.array([[0, 0], [2, 1], [0, 2], [0.6, 1]], dtype=float)
-KEYHOLE = np.array(  # a square with a square hole, joined by a bridge that is gone along twice
+KEYHOLE = np.array(  # a square with a square hole, joined by a bridge of two edges
     [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0], [1, 1], [1, 3], [3, 3], [3, 1], [1, 1]], dtype=float
 )
 
@@ -21,7 +21,7 @@ def shoelace(polygon):
 
 @pytest.mark.parametrize("polygon", [U, DART, KEYHOLE], ids=["U", "dart", "keyhole"])
 @pytest.mark.parametrize("plane", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
-def test_a_polygon_is_covered_once_wherever_it_begins(polygon, plane):
+def test_a_polygon_is_covered_once_for_any_first_corner(polygon, plane):
     if polygon is not KEYHOLE:
         polygon = np.roll(polygon, 3, axis=0)
     for turned in (polygon, polygon[::-1]):
@@ -40,7 +40,7 @@ def area_in_file(mesh):
 
 
 def write(folder, kind, faces=(range(8),)):
-    """Faces on the corners of the U, which is one polygon; COLLADA of the U alone."""
+    """Write faces whose corners are those of U, by default U itself. COLLADA files always have U alone."""
     points = "".join(f"{x} {y} 0\n" for x, y in U)
     rows = "".join(" ".join(map(str, (len(face), *face))) + "\n" for face in faces)
     path = folder / f"a.{kind}"

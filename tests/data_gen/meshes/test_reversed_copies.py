@@ -1,4 +1,4 @@
-"""Source of truth: the same object without the part that should not be seen.
+"""Source of truth: the same object without the part that should be invisible.
 
 A part that is wound inwards is the inner side of another part where it lies on it, and an outline where it is one-sided
 and stands around others.
@@ -27,7 +27,7 @@ def draw(backend, mesh, size=64):
 
 
 def write_obj(path, parts):
-    """An OBJ with one material a part: (corners, faces, colour)."""
+    """Write an OBJ with one material per part: (corners, faces, colour)."""
     lines, start = ["mtllib a.mtl"], 1
     for name, (points, faces, _) in enumerate(parts):
         lines += [f"v {x} {y} {z}" for x, y, z in points]
@@ -48,7 +48,7 @@ def test_the_reversed_copy_of_a_solid_is_its_inner_side(tmp_path, backend):
     assert wrong.mean() < 0.001
 
 
-def test_a_solid_alone_or_beside_others_is_still_turned_outwards(tmp_path):
+def test_a_solid_alone_or_next_to_others_is_oriented_outwards(tmp_path):
     ball = trimesh.creation.icosphere(1)
     inward = (ball.vertices, ball.faces[:, ::-1], "0.1 0.1 0.8")
     write_obj(tmp_path / "a.obj", [inward, (ball.vertices + [5, 0, 0], ball.faces, "1 0 0")])
@@ -56,7 +56,7 @@ def test_a_solid_alone_or_beside_others_is_still_turned_outwards(tmp_path):
 
 
 def outlined(folder, one_sided):
-    """A red ball in a black hull that is wound inwards."""
+    """A red ball in a black hull with faces that are oriented inwards."""
     ball = trimesh.creation.icosphere(2)
     count = len(ball.vertices)
     header, buffer = gltf(
@@ -77,7 +77,7 @@ def outlined(folder, one_sided):
     return load_mesh(folder / "a.glb")
 
 
-def test_a_one_sided_hull_is_an_outline_and_a_two_sided_one_hides_what_is_inside(tmp_path, backend):
+def test_a_one_sided_hull_is_an_outline_and_a_double_sided_one_hides_its_inside(tmp_path, backend):
     picture = draw(backend, outlined(tmp_path, True))[0]
     assert picture[32, 32, 0] > 150
     assert picture[32, 32, 2] < 60
@@ -86,8 +86,8 @@ def test_a_one_sided_hull_is_an_outline_and_a_two_sided_one_hides_what_is_inside
     assert draw(backend, outlined(tmp_path, False))[0, 32, 32, :3].max() < 60
 
 
-def test_where_nothing_else_is_the_inner_side_of_a_one_sided_surface_is_seen(tmp_path, backend):
-    """A hole in the mask of one view would carve the surface away that the others see."""
+def test_inner_sides_of_one_sided_surfaces_are_drawn_before_the_background(tmp_path, backend):
+    """With a hole in the mask of one view, carving would remove the surface that other views show."""
     sheet = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], dtype=np.float32)
     (tmp_path / "a.glb").write_bytes(glb_bytes(*gltf(positions=sheet, faces=[[0, 1, 2]])))
     rig = rigs.orbit(2, 32, elevation=0.0)

@@ -21,7 +21,7 @@ with (Path(__file__).parent / "samples.csv").open(newline="", encoding="utf-8") 
 
 
 def verdict(path):
-    """What becomes of a model, and what is said of it."""
+    """The outcome for a model, and its warnings or error."""
     try:
         warnings = load_mesh(path).warnings
     except MeshError as error:
@@ -30,7 +30,7 @@ def verdict(path):
 
 
 @pytest.mark.skipif(MODELS is None, reason="HYPERPLANES_MODELS names no folder of sample models")
-def test_sample_models_are_drawn_warned_of_or_refused_as_expected():
+def test_sample_models_are_drawn_with_or_without_warnings_or_refused_as_expected():
     files = {path.as_posix(): path for path in Path(MODELS).rglob("*") if path.is_file()}
     found, wrong = 0, []
     for sample in SAMPLES:
@@ -49,6 +49,6 @@ def test_sample_models_are_drawn_warned_of_or_refused_as_expected():
     assert not wrong, "\n".join(wrong)
 
 
-def test_the_table_is_whole():
+def test_the_table_is_complete():
     assert {sample["verdict"] for sample in SAMPLES} == {"drawn", "read", "refused", "warned"}
     assert len({sample["path"] for sample in SAMPLES}) == len(SAMPLES)

@@ -35,7 +35,7 @@ def test_there_are_55_classes_and_the_numbers_of_the_paper():
     assert class_of_synset("00000001") == "00000001"
 
 
-def test_version_2_finds_its_textures_beside_the_models_folder(tmp_path):
+def test_version_2_finds_its_textures_next_to_the_models_folder(tmp_path):
     mesh = load_mesh(write_model(tmp_path, CAR, "abc", 2))
     assert mesh.warnings == ()
     assert texel(mesh) == (5, 6, 7)
@@ -53,8 +53,8 @@ def test_version_1_finds_its_textures_inside_its_folder(tmp_path):
 
 
 @pytest.mark.parametrize(("version", "texture"), [(2, "../../b/images/texture0.jpg"), (1, "../b/images/texture0.jpg")])
-def test_a_model_never_reads_another_models_files(tmp_path, version, texture):
-    """It takes a file of that name of its own, and says so, or is refused; the other model is only read in one tree."""
+def test_a_model_does_not_read_files_of_another_model(tmp_path, version, texture):
+    """It uses its own file of that name with a warning, or is refused. Other models are read only within one tree."""
     write_model(tmp_path, CAR, "b", version)
     path = write_model(tmp_path, CAR, "a", version, texture=texture)
     assert load_mesh(path).warnings == (f"{texture}: not there, images/texture0.jpg taken",)
@@ -84,7 +84,7 @@ def test_a_tree_gives_classes_and_the_split_of_the_paper(tmp_path, version):
     assert [mesh.name for mesh in find_meshes(tmp_path / CAR).meshes] == [f"car_m{index}" for index in range(5)]
 
 
-def test_folders_that_are_named_after_dates_are_no_classes(tmp_path):
+def test_folders_named_after_dates_are_no_classes(tmp_path):
     for name in ("20240131/chair/model.obj", "20240131/sofa/model.obj", "20240207/lamp/model.obj", "other.glb"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
@@ -100,13 +100,13 @@ def test_folders_that_are_named_after_dates_are_no_classes(tmp_path):
     ]
 
 
-def test_a_class_of_another_number_is_one_in_version_2(tmp_path):
+def test_unknown_numbers_are_classes_in_version_2(tmp_path):
     write_model(tmp_path, "00000001", "a", 2)
     assert [(mesh.name, mesh.class_name) for mesh in find_meshes(tmp_path).meshes] == [("00000001_a", "00000001")]
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_meshes_beside_the_models_of_a_tree_are_listed(tmp_path, version):
+def test_meshes_next_to_the_models_of_a_tree_are_listed(tmp_path, version):
     write_model(tmp_path, CAR, "a", version)
     for name in (f"{CAR}/b.obj", "20240131/chair/model.obj", "more/c.glb", "d.fbx"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -117,7 +117,7 @@ def test_meshes_beside_the_models_of_a_tree_are_listed(tmp_path, version):
     assert found.unreadable[0][1].startswith("expected a model of the ShapeNetCore tree, found another mesh")
 
 
-def test_the_official_split_counts_where_it_is_given(tmp_path):
+def test_the_official_split_is_used_if_given(tmp_path):
     for model in ("a", "b", "c"):
         write_model(tmp_path, PLANE, model, 2)
     rows = f"id,synsetId,subSynsetId,modelId,split\n1,{PLANE},02690373,a,test\n2,2691156,02690373,b,val\n"
@@ -128,7 +128,7 @@ def test_the_official_split_counts_where_it_is_given(tmp_path):
     assert [mesh.split for mesh in find_meshes(tmp_path).meshes] == ["test", "train", None]
 
 
-def test_a_row_of_a_split_file_may_lack_its_last_column(tmp_path):
+def test_rows_of_a_split_file_may_have_no_last_column(tmp_path):
     (tmp_path / "s.csv").write_text(f"modelId,split,synsetId\na,test,{PLANE}\nb,val\n")
     assert read_split_file(tmp_path / "s.csv")[PLANE, "a"] == "test"
 

@@ -1,4 +1,4 @@
-"""Meshes that the tests of the renderer draw, here and in other processes: imports little, so those start fast."""
+"""Meshes for tests of the renderer, also in other processes. The module imports little, so that these start fast."""
 
 import sys
 
@@ -21,12 +21,12 @@ def sheet(size=1.0, *, uv=True):
 
 
 def placed(mesh, pose):
-    """A copy of a mesh in the coordinates that a transform leads to."""
+    """A transformed copy of a mesh."""
     return mesh.copy().apply_transform(pose)
 
 
 def tricky_parts():
-    """Parts with a texture, vertex colours, face colours, reversed faces, a mirrored one, a cutoff and glass."""
+    """Parts with a texture, vertex colours, face colours, reversed faces, mirrored faces, an alpha cutoff and glass."""
     generator = np.random.default_rng(0)
     texels = generator.integers(0, 255, (16, 16, 3), dtype=np.uint8).repeat(16, axis=0).repeat(16, axis=1)
     textured = trimesh.creation.box((0.6, 0.6, 0.6))
@@ -60,7 +60,7 @@ def tricky_parts():
 
 
 def draw_tricky(backend):
-    """The tricky parts by one renderer: RGBA (view, height, width, 4)."""
+    """The tricky parts drawn by one renderer, as RGBA (view, height, width, 4)."""
     return MeshRenderer(backend).render(tricky_parts(), rigs.fixed(4, 48)).rgba
 
 

@@ -1,6 +1,6 @@
-"""Source of truth: the same object with the faces that turn away from the camera left out before it is drawn (culled).
+"""Source of truth: the same object, drawn without the faces that face away from the camera (culled).
 
-Nearly every face of ShapeNet's models is there twice, the second wound the other way round and of another colour.
+Nearly all faces of ShapeNet's models exist twice; the second one is reversed and has another colour.
 """
 
 import numpy as np
@@ -35,7 +35,7 @@ def _chair():
 
 
 def _grid():
-    """A slanted sheet: (its triangles, the same quadrilaterals cut along the other diagonal)."""
+    """A slanted sheet: (its triangles, the same quadrilaterals divided along the other diagonal)."""
     x, y = np.meshgrid(np.linspace(-0.8, 0.8, 9), np.linspace(-0.8, 0.8, 9))
     points = np.stack((x, y, 0.3 * x + 0.1 * y), -1)
     a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
@@ -60,7 +60,7 @@ def _culled(corners, eye):
 
 
 @pytest.mark.parametrize("kind", ["exactly", "nearly", "other diagonals"])
-def test_of_faces_in_one_place_the_one_that_faces_the_camera_is_seen(backend, kind):
+def test_of_coincident_faces_the_one_that_faces_the_camera_is_visible(backend, kind):
     colours = [(200, 40, 40, 255), (40, 60, 220, 255)]
     sides = _doubled(kind)
     rig = rigs.fixed(6, 64)
@@ -87,8 +87,8 @@ def test_doubled_glass_is_blended_once(backend):
     np.testing.assert_allclose(alpha, 102, atol=1)
 
 
-def test_a_smooth_ball_with_every_face_doubled_is_shaded_as_one_without(tmp_path):
-    """The vertex normals of a face and its reversed copy cancel where they share their vertices."""
+def test_a_smooth_ball_with_doubled_faces_is_shaded_as_one_without(tmp_path):
+    """The vertex normals of a face and its reversed copy cancel if they share their vertices."""
     ball = trimesh.creation.icosphere(2)
     rows = "".join(f"v {x} {y} {z}\n" for x, y, z in ball.vertices) + "s 1\n"
     pictures = []
@@ -98,8 +98,8 @@ def test_a_smooth_ball_with_every_face_doubled_is_shaded_as_one_without(tmp_path
     assert np.array_equal(*pictures)
 
 
-def test_what_has_one_side_only_is_still_seen_from_both(backend):
-    """A sheet before a wall, a five hundredth of the radius away, both seen from behind: the sheet is in front."""
+def test_a_face_without_a_copy_is_visible_from_both_sides(backend):
+    """A red sheet is 1/500 of the radius behind a blue wall. From the back, the sheet is in front."""
     sheet = np.array([[[-0.5, -0.5, 0], [0.5, -0.5, 0], [0, 0.5, 0]]])
     wall = 2 * sheet + [0, 0, 0.002]
     rig = rigs.orbit(2, 32, elevation=0.0)

@@ -1,4 +1,4 @@
-"""Source of truth: the shading formula on white and grey surfaces, the stated bounds, and what is refused."""
+"""Source of truth: the shading formula for white and grey surfaces, the stated bounds, and error messages."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from hyperplanes.utilities.colour import linear_from_srgb, srgb_from_linear
 
 
 def _sphere_shades(lighting, albedo, towards=None):
-    """Shades of a matt sphere: normals all over, each seen from straight in front or from one direction."""
+    """Shades of a matt sphere: all normals, each seen along the normal or from one direction."""
     normals = random(400, 8, seed=0).world_from_camera[:, :3, 3] / 3.0
     views = normals if towards is None else np.broadcast_to(np.asarray(towards, float), normals.shape)
     normals = facing(normals, normals, views)
@@ -34,11 +34,11 @@ def test_lambert_closed_form():
     colour = shade(
         np.full((1, 3), 0.6), np.zeros((1, 3)), normal, normal, one, none, lighting, lighting.directions(np.eye(4))
     )
-    # The highlight of a fully rough dielectric adds between 0 and 0.02 of the light.
+    # The specular part of a fully rough dielectric adds between 0 and 0.02 of the light.
     assert srgb_from_linear(np.array(0.21)) < colour[0, 0] < srgb_from_linear(np.array(0.21 + 0.5 * 0.5 * 0.04))
 
 
-def test_what_is_too_bright_is_rolled_off_below_white():
+def test_very_bright_values_are_compressed_below_white():
     lighting = Lighting((), sky=(4.0,) * 3, ground=(4.0,) * 3)
     normal = np.array([[0.0, 1.0, 0.0]])
     flat = np.ones((1, 1)), np.zeros((1, 1))
@@ -54,11 +54,11 @@ def test_what_is_too_bright_is_rolled_off_below_white():
 @pytest.mark.parametrize(
     "lighting", [resolve_lighting("studio"), *(resolve_lighting("random", seed=s) for s in range(8))]
 )
-def test_no_black_sides_and_no_burnt_whites(lighting):
+def test_no_side_is_black_and_no_white_is_clipped(lighting):
     white, grey = _sphere_shades(lighting, 0.9), _sphere_shades(lighting, 0.5)
     assert white.max() < 1.0
     assert grey.min() > 0.30
-    # And still a shape to be seen: the brightest side of grey is well above the darkest.
+    # The shape is still visible: the brightest side of grey is well above the darkest.
     assert grey.max() > 1.3 * grey.min()
 
 
@@ -70,7 +70,7 @@ def test_headlight_follows_the_camera_and_the_others_do_not():
     np.testing.assert_array_equal(studio.directions(pose), studio.directions(np.eye(4)))
 
 
-def test_random_follows_its_seed():
+def test_random_lights_depend_on_their_seed():
     assert resolve_lighting("random", seed=1) == resolve_lighting("random", seed=1)
     assert resolve_lighting("random", seed=1) != resolve_lighting("random", seed=2)
 
@@ -92,11 +92,11 @@ def test_sheets_are_lit_on_both_sides():
         (lambda: Lighting((Light((0, 0, 1.0), (1, 1, 1)),) * 5, (0, 0, 0), (0, 0, 0)), "at most 4, received 5"),
     ],
 )
-def test_wrong_input_says_what_was_received(call, message):
+def test_wrong_input_is_named_in_the_error(call, message):
     with pytest.raises(ValueError, match=message):
         call()
 
 
-def test_presets_are_all_known():
+def test_all_presets_are_listed():
     for name in LIGHTING_PRESETS:
         assert isinstance(resolve_lighting(name), Lighting)

@@ -1,6 +1,6 @@
-"""Pictures of known shapes against closed forms, for every renderer that works here, and the renderers compared.
+"""Source of truth: closed forms of pictures of simple shapes, for each renderer that works, and other renderers.
 
-Only one OpenGL platform can be used in a process, so OSMesa, where EGL is the first, draws in a subprocess.
+A process can use only one OpenGL platform. If that is EGL, OSMesa runs in a subprocess.
 """
 
 import os
@@ -42,7 +42,7 @@ def backend(request):
 
 
 def _closest(mesh, points):
-    """The nearest face and the distance to it, by trying every face."""
+    """The nearest face of each ray and its distance, by brute force."""
     count = len(mesh.faces)
     nearest = trimesh.triangles.closest_point(
         np.tile(mesh.triangles, (len(points), 1, 1)), np.repeat(points, count, axis=0)
@@ -52,7 +52,7 @@ def _closest(mesh, points):
 
 
 def _emissive(mesh, colour=(255, 255, 255)):
-    """The mesh as a lamp: its picture is flat, so that only coverage matters."""
+    """The mesh with emission only, so that its colour is constant and only coverage matters."""
     material = trimesh.visual.material.PBRMaterial(
         baseColorFactor=[0, 0, 0, 255], emissiveFactor=[c / 255 for c in colour], metallicFactor=0.0
     )
@@ -65,7 +65,7 @@ def _front_rig(resolution, distance=3.0):
 
 
 def _kornia_pixels(rig, points):
-    """Where Kornia's camera sees points: (view, point, 2)."""
+    """Pixels (view, point, 2) of points, by Kornia's camera."""
     return rig.cameras().project(torch.from_numpy(np.tile(points, (len(rig), 1, 1)))).numpy()
 
 
@@ -75,8 +75,8 @@ def _over_white(rgba):
 
 
 @pytest.mark.parametrize("rig", [rigs.fixed(5, 64), replace(rigs.fixed(5, 120), width=200)])
-def test_convention_spheres_are_where_kornia_projects_them(backend, rig):
-    # The image of a small sphere is an ellipse whose centroid differs from the centre's projection by O(radius^2).
+def test_spheres_are_at_the_pixels_of_kornias_projection(backend, rig):
+    # The centroid of a small sphere's image differs from the projection of its centre by O(radius^2).
     centres = np.array([[0.0, 0.0, 0.0], [0.5, 0.3, -0.2], [-0.4, -0.5, 0.4], [0.1, 0.6, 0.5]])
     expected = _kornia_pixels(rig, centres)
     renderer = MeshRenderer(backend, supersample=8)
@@ -90,7 +90,7 @@ def test_convention_spheres_are_where_kornia_projects_them(backend, rig):
 
 
 def test_alpha_is_the_covered_area_of_the_pixel(backend):
-    # A square whose image reaches from u0 to u1 covers of pixel i the overlap of [u0, u1] and [i - 1/2, i + 1/2].
+    # A square with an image from u0 to u1 covers the overlap of [u0, u1] and [i - 1/2, i + 1/2] of pixel i.
     rig = _front_rig(48)
     size = 0.613
     (u0, v1), (u1, v0) = _kornia_pixels(rig, np.array([[-size, -size, 0.0], [size, size, 0.0]]))[0]
@@ -99,7 +99,7 @@ def test_alpha_is_the_covered_area_of_the_pixel(backend):
     down = np.clip(np.minimum(v1, pixel + 0.5) - np.maximum(v0, pixel - 0.5), 0.0, 1.0)
     for supersample in (1, 3, 8):
         alpha = MeshRenderer(backend, supersample=supersample).render([sheet(size)], rig).rgba[0, ..., 3] / 255.0
-        # Samples stand 1 / supersample apart, so an edge is off by at most half of that.
+        # Samples have distances of 1 / supersample, so that an edge is wrong by at most half of that.
         np.testing.assert_allclose(alpha, down[:, None] * across, atol=1.01 / supersample / 2 + 0.004)
 
 
@@ -108,15 +108,15 @@ def test_sphere_silhouette_has_the_area_of_its_cone(backend):
     ball = trimesh.creation.icosphere(5, radius=0.8)
     alpha = MeshRenderer(backend, supersample=4).render([ball], rig).rgba[0, ..., 3] / 255.0
     radius = rig.intrinsics[0, 0, 0] * np.tan(np.arcsin(0.8 / 3.0))
-    # 0.05 pixels of the radius: icospheres are inscribed.
+    # A tolerance of 0.05 pixels of the radius, since icospheres are inscribed.
     assert abs(np.sqrt(alpha.sum() / np.pi) - radius) < 0.05
-    # 4 x 4 samples: sixteenths, and many of them.
+    # With 4 x 4 samples, alpha has many multiples of 1/16.
     np.testing.assert_allclose(alpha * 16, np.rint(alpha * 16), atol=16 / 510 + 1e-9)
     assert len(np.unique(alpha)) > 12
 
 
 def test_no_dark_fringe_over_white(backend):
-    # An emissive off-white sphere over white: every pixel, edge or not, lies between the two colours.
+    # Each pixel of an emissive off-white sphere over white, also at edges, is between the two colours.
     ball = _emissive(trimesh.creation.icosphere(4, radius=0.8), (240, 240, 240))
     rgba = MeshRenderer(backend).render([ball], rigs.fixed(2, 64), lighting=DARK).rgba
     inside = rgba[rgba[..., 3] == 255]
@@ -130,11 +130,11 @@ def test_no_dark_fringe_over_white(backend):
 
 
 def _assert_agree(one, other):
-    """Silhouettes to half a pixel and colours to 1 of 255 on average, 99 of 100 pixels to 4."""
+    """Silhouettes agree to half a pixel, and colours to 1 of 255 on average and to 4 for 99 % of pixels."""
     a, b = one.astype(float), other.astype(float)
-    # An edge that is half a pixel off changes alpha by a half.
+    # An edge with an error of half a pixel changes alpha by 1/2.
     assert np.abs(a[..., 3] - b[..., 3]).max() < 128
-    # And the area by far less.
+    # The area changes much less.
     np.testing.assert_allclose(a[..., 3].sum(axis=(1, 2)), b[..., 3].sum(axis=(1, 2)), rtol=2e-3)
     difference = np.abs(_over_white(a) - _over_white(b)).max(axis=-1)[a[..., 3] > 0]
     assert difference.mean() < 1.0
@@ -188,8 +188,8 @@ def test_reversed_faces_look_like_any_others(backend):
 
 
 @pytest.mark.parametrize("class_name", ONE_SIDED)
-def test_inner_sides_of_generated_objects_are_never_seen(class_name):
-    """Property: what is closed covers the same samples without its inner sides, and looks the same.
+def test_inner_sides_of_generated_objects_are_not_visible(class_name):
+    """Property: without their inner sides, closed objects cover the same samples and have the same picture.
 
     But for a sample here and there on an outline itself, where both sides have one depth.
     """
@@ -204,7 +204,7 @@ def test_inner_sides_of_generated_objects_are_never_seen(class_name):
         assert (whole != outer).any(axis=-1).sum() < 0.002 * (whole[..., 3] > 0).sum()
 
 
-def test_a_sheet_is_seen_from_both_sides(backend):
+def test_a_sheet_is_visible_from_both_sides(backend):
     rig = rigs.orbit(2, 32, elevation=0.0)
     rgba = MeshRenderer(backend).render([sheet()], rig).rgba
     assert (rgba[:, 16, 16, 3] == 255).all()
@@ -212,7 +212,7 @@ def test_a_sheet_is_seen_from_both_sides(backend):
 
 
 def test_glass_over_black_and_white_closed_form(backend):
-    # Emissive glass of alpha 0.4 before an emissive wall: out = 0.4 glass + 0.6 wall, alpha 1; alone, alpha 0.4.
+    # Emissive glass of alpha 0.4 before an emissive wall gives 0.4 glass + 0.6 wall and alpha 1; alone, alpha 0.4.
     glass, wall = _emissive(sheet(0.9), (255, 0, 0)), _emissive(sheet(0.5), (0, 0, 255))
     glass.visual.material.baseColorFactor = [0, 0, 0, 102]
     glass.visual.material.alphaMode = "BLEND"
@@ -224,8 +224,8 @@ def test_glass_over_black_and_white_closed_form(backend):
 
 @pytest.mark.parametrize("first", [-0.3, 0.3])
 def test_of_the_translucent_faces_of_a_surface_the_nearer_is_in_front(backend, first):
-    # Red glass of alpha 1/2 on one side, blue on the other, in either order of the file: 2/3 of what is seen of them
-    # is the nearer one's.
+    # Red glass of alpha 1/2 on one side and blue glass on the other, in any order of the file: the nearer one
+    # contributes 2/3 of the colour of both.
     panes = trimesh.util.concatenate([sheet(0.9, uv=False), sheet(0.9, uv=False)])
     panes.vertices[:4, 2], panes.vertices[4:, 2] = first, -first
     red, blue = [255, 0, 0, 128], [0, 0, 255, 128]
@@ -238,7 +238,7 @@ def test_of_the_translucent_faces_of_a_surface_the_nearer_is_in_front(backend, f
 
 
 def test_transparent_texels_do_not_bleed(backend):
-    # Green leaves on transparent black: wherever anything is seen, it is as green as the leaf.
+    # Green leaves on transparent black: all visible pixels are as green as the leaf.
     texels = np.zeros((64, 64, 4), np.uint8)
     texels[::8, :, :] = texels[1::8] = texels[2::8] = (40, 220, 40, 255)
     square = sheet(0.9)
@@ -251,8 +251,8 @@ def test_transparent_texels_do_not_bleed(backend):
 
 
 @pytest.mark.parametrize("alpha_mode", ["MASK", "BLEND"])
-def test_what_is_behind_many_clear_sheets_is_seen(backend, alpha_mode):
-    # Cards of foliage: their clear texels add nothing, however many there are in front of the wall.
+def test_objects_behind_many_transparent_sheets_are_visible(backend, alpha_mode):
+    # As in foliage, any number of transparent texels in front of the wall adds nothing.
     clear = sheet(0.9)
     texels = np.zeros((4, 4, 4), np.uint8)
     texels[0, 0] = 255
@@ -285,7 +285,7 @@ def test_texture_is_the_right_way_up(backend):
 
 @pytest.mark.parametrize("kind", ["vertex", "face", "texture", "kd"])
 @pytest.mark.parametrize("colour", [(180, 90, 60), (16, 17, 30)])
-def test_srgb_colours_come_out_alike_however_they_are_given(backend, kind, colour):
+def test_srgb_colours_are_drawn_alike_for_every_way_to_give_them(backend, kind, colour):
     square = sheet(0.9)
     if kind == "texture":
         square.visual.material = trimesh.visual.material.SimpleMaterial(image=Image.new("RGB", (4, 4), colour))
@@ -302,7 +302,7 @@ def test_srgb_colours_come_out_alike_however_they_are_given(backend, kind, colou
     np.testing.assert_allclose(rgba, [*expected, 255], atol=1.5)
 
 
-def test_geometry_lies_on_the_mesh_to_a_hundredth_of_a_pixel():
+def test_geometry_is_on_the_mesh_to_a_hundredth_of_a_pixel():
     pose = trimesh.transformations.translation_matrix([0.1, -0.2, 0.3]) @ np.diag([1.0, 1.3, 0.7, 1.0])
     mesh = placed(trimesh.creation.icosphere(2, radius=0.6), pose)
     mesh.metadata["smooth"] = False
@@ -324,11 +324,11 @@ def test_geometry_lies_on_the_mesh_to_a_hundredth_of_a_pixel():
         towards = world_from_camera[:3, 3] - points
         assert (np.einsum("pi,pi->p", normals, towards) > 0).all()
         assert not out.coordinates[view][~mask].any()
-        # With one sample a pixel, colour and geometry see the same.
+        # With one sample per pixel, colour and geometry have the same coverage.
         assert np.array_equal(mask, out.rgba[view, ..., 3] > 0)
 
 
-def test_geometry_looks_through_what_is_mostly_clear():
+def test_geometry_ignores_mostly_transparent_surfaces():
     glass = _emissive(sheet(0.9))
     glass.visual.material.alphaMode = "BLEND"
     wall, behind = sheet(0.9), trimesh.transformations.translation_matrix([0, 0, -0.5])
@@ -339,7 +339,7 @@ def test_geometry_looks_through_what_is_mostly_clear():
         np.testing.assert_allclose(out.depth[0, 4, 4], depth, atol=1e-6)
 
 
-def test_blank_and_impossible_objects_are_named(backend):
+def test_invisible_and_invalid_objects_are_named(backend):
     away = trimesh.transformations.translation_matrix([50.0, 0, 0])
     empty = trimesh.Trimesh()
     broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], process=False)
@@ -362,7 +362,7 @@ def test_blank_and_impossible_objects_are_named(backend):
     assert renderer.render([sheet()], rig).rgba.any()
 
 
-def test_wrong_arguments_say_what_was_received():
+def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match="expected 1 to 8, received 9"):
         MeshRenderer("embree", supersample=9)
     with pytest.raises(ValueError, match="received 'vulkan'"):
@@ -393,13 +393,13 @@ def test_rasterisers_share_the_context_and_other_threads_are_refused():
         MeshRenderer("pyrender-osmesa")
 
 
-def test_renderer_that_cannot_start_says_what_to_do(monkeypatch):
+def test_the_error_of_a_renderer_that_cannot_start_has_a_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "embreex", None)
     with pytest.raises(RendererError, match="'embree': expected it to start, found .*Remedy: pip install embreex"):
         MeshRenderer("embree")
 
 
-def test_unreferenced_bad_vertices_and_vanished_normals_do_no_harm():
+def test_unreferenced_invalid_vertices_and_zero_normals_are_harmless():
     corners = [[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [np.nan, 0, 0]]
     mesh = trimesh.Trimesh(corners, [[0, 1, 2]], vertex_normals=np.zeros((4, 3)), process=False, validate=False)
     out = MeshRenderer("embree").render([mesh], _front_rig(9), channels=("rgba", "normals"))
@@ -407,7 +407,7 @@ def test_unreferenced_bad_vertices_and_vanished_normals_do_no_harm():
     np.testing.assert_allclose(out.normals[0, 4, 4], [0, 0, 1], atol=1e-6)
 
 
-def test_metal_is_not_black_and_unset_metal_is_no_metal():
+def test_metal_is_not_black_and_the_default_is_not_metallic():
     def shade(**material):
         square = sheet(0.9)
         square.visual.material = trimesh.visual.material.PBRMaterial(baseColorFactor=[128, 128, 128, 255], **material)

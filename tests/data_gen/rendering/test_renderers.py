@@ -1,4 +1,4 @@
-"""Source of truth: the stated order of renderers, and fakes of the subprocess that tries each of them."""
+"""Source of truth: the stated order of renderers, with replacements of the subprocess that tries each of them."""
 
 import subprocess
 import sys
@@ -11,14 +11,14 @@ from data_gen.rendering.renderers import ProbeResult, RendererError, RendererInf
 
 @pytest.fixture
 def fresh(monkeypatch):
-    """Nothing remembered."""
+    """Clear the cache of outcomes."""
     monkeypatch.setattr(renderers, "_cache", {})
     return monkeypatch
 
 
 @pytest.fixture
 def pretend(fresh):
-    """Let only some renderers work; returns the list of those tried."""
+    """Make only some renderers work. Returns the list of those that were tried."""
     tried = []
 
     def arrange(*working):
@@ -44,14 +44,14 @@ def test_embree_works_in_a_real_subprocess():
 
 
 @pytest.mark.parametrize("name", renderers.RENDERERS)
-def test_outcome_is_complete(name):
+def test_the_outcome_has_all_values(name):
     outcome = renderers.probe(name)
     assert outcome.works == (outcome.remedy == "")
     assert outcome.message
     assert "\n" not in outcome.message
 
 
-def test_order_is_egl_osmesa_embree(pretend):
+def test_the_order_is_egl_osmesa_embree(pretend):
     tried = pretend("embree")
     renderer = renderers.find_renderer()
     assert tried == ["pyrender-egl", "pyrender-osmesa", "embree"]
@@ -60,31 +60,31 @@ def test_order_is_egl_osmesa_embree(pretend):
     assert "apt-get install -y libegl1 libgl1" in renderer.advice[0]
 
 
-def test_a_better_renderer_is_advised_wherever_there_is_one(pretend):
+def test_a_better_renderer_is_recommended_if_there_is_one(pretend):
     pretend("pyrender-osmesa", "embree")
     (advice,) = renderers.find_renderer().advice
     assert advice.startswith("pyrender-egl does not work here")
 
 
-def test_best_is_taken_without_trying_the_rest(pretend):
+def test_the_best_is_used_without_trying_the_others(pretend):
     tried = pretend("pyrender-egl", "embree")
     assert renderers.find_renderer() == RendererInfo("pyrender-egl", "fine")
     assert tried == ["pyrender-egl"]
 
 
-def test_choice_must_work(pretend):
+def test_the_chosen_renderer_has_to_work(pretend):
     pretend("embree")
     with pytest.raises(RendererError, match="'pyrender-osmesa': .* no library. Remedy: apt-get install -y libosmesa6"):
         renderers.find_renderer("pyrender-osmesa")
 
 
-def test_nothing_works(pretend):
+def test_that_no_renderer_works_is_an_error(pretend):
     pretend()
     with pytest.raises(RendererError, match="no renderer works here .* apt-get install -y libegl1 libgl1"):
         renderers.find_renderer()
 
 
-def test_each_is_tried_once(pretend):
+def test_each_renderer_is_tried_once(pretend):
     tried = pretend("embree")
     first = renderers.find_renderer()
     assert renderers.find_renderer() == first
@@ -92,7 +92,7 @@ def test_each_is_tried_once(pretend):
     assert len(tried) == 3
 
 
-def test_unknown_name():
+def test_an_unknown_name_is_refused():
     with pytest.raises(ValueError, match="pyrender-egl, pyrender-osmesa, embree, received 'vulkan'"):
         renderers.find_renderer("vulkan")
     with pytest.raises(ValueError, match="received 'vulkan'"):
@@ -108,14 +108,14 @@ def test_unknown_name():
         ("pass", "exit code 0"),
     ],
 )
-def test_trouble_in_the_subprocess_becomes_one_line(fresh, code, message):
+def test_errors_of_the_subprocess_are_one_line(fresh, code, message):
     real = subprocess.run
     fresh.setattr(renderers.subprocess, "run", lambda command, **options: real([sys.executable, "-c", code], **options))
     outcome = renderers.probe("embree")
     assert (outcome.works, outcome.message, outcome.remedy) == (False, message, "pip install embreex")
 
 
-def test_hanging_renderer_is_given_up(fresh):
+def test_a_hanging_renderer_is_ended(fresh):
     real = subprocess.run
     sleep = [sys.executable, "-c", "import time; time.sleep(60)"]
     fresh.setattr(renderers, "_PROBE_SECONDS", 0.5)
@@ -123,7 +123,7 @@ def test_hanging_renderer_is_given_up(fresh):
     assert renderers.probe("embree").message == "no picture within 0.5 s"
 
 
-def test_importing_rigs_and_backends_is_light():
+def test_importing_rigs_and_backends_loads_little():
     code = (
         "import sys, data_gen, data_gen.rigs, data_gen.rendering.renderers, data_gen.rendering.lighting;"
         "sys.exit(','.join({'pyrender', 'OpenGL', 'trimesh', 'torch', 'embreex', 'scipy'} & set(sys.modules)) or 0)"

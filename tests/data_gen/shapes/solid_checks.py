@@ -1,4 +1,4 @@
-"""Slow, obvious geometry that the objects are compared with, and their hash; imports little, as processes need it."""
+"""Brute-force geometry to compare objects with, and hashes of objects. Imports little, since processes import it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def digest(scene: object) -> str:
 
 
 def _crossings(start: np.ndarray, end: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Which segments (s, 3) -> (s, 3) cross which triangles (t, 3, 3): (s, t), after Moeller and Trumbore."""
+    """Whether segments (s, 3) -> (s, 3) intersect triangles (t, 3, 3): (s, t), after Moeller and Trumbore."""
     direction = (end - start)[:, None]
     edge1, edge2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     p = np.cross(direction, edge2[None])
@@ -36,12 +36,12 @@ def _crossings(start: np.ndarray, end: np.ndarray, triangles: np.ndarray) -> np.
 
 
 def _near(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Which of the (n, k, 3) point groups have bounds that meet the box."""
+    """Which of the groups of points (n, k, 3) have bounds that intersect the box."""
     return ((points.min(1) <= high) & (points.max(1) >= low)).all(1)
 
 
 def touch(one: Part, other: Part) -> bool:
-    """Whether the surfaces of two parts cross, or one part holds the other."""
+    """Whether the surfaces of two parts intersect, or one part contains the other."""
     a, b = one.solid.vertices, other.solid.vertices
     low, high = np.maximum(a.min(0), b.min(0)), np.minimum(a.max(0), b.max(0))
     if (low > high).any():
@@ -88,7 +88,7 @@ def _overlap(first: np.ndarray, second: np.ndarray, margin: float) -> bool:
 
 
 def fighting(parts: list[Part], gap: float) -> set[tuple[str, str]]:
-    """Pairs of parts with overlapping faces that look the same way and are closer than `gap`, in the object's unit.
+    """Pairs of parts with overlapping faces of the same direction that are closer than `gap`, in units of the object.
 
     Faces of one material do not count: whichever of them wins, the pixel is the same.
     """

@@ -1,4 +1,4 @@
-"""What every object of a class that means something promises; `random` has tests of its own.
+"""Properties of the objects of all classes except `random`, which has its own tests.
 
 Sources of truth: trimesh's topology and volume, solid_checks' brute force, hashes.
 """
@@ -24,7 +24,7 @@ assemble, make = cache(assemble), cache(make)
 
 
 @pytest.mark.parametrize("class_name", KINDS)
-def test_every_part_is_watertight_right_way_out_and_has_its_volume(class_name):
+def test_every_part_is_watertight_oriented_outwards_and_has_its_volume(class_name):
     for seed in range(15):
         parts = assemble(class_name, seed)
         assert len({part.name for part in parts}) == len(parts)
@@ -37,8 +37,8 @@ def test_every_part_is_watertight_right_way_out_and_has_its_volume(class_name):
 
 
 @pytest.mark.parametrize("class_name", KINDS)
-def test_nothing_floats_and_nothing_flickers(class_name):
-    """Brute force: crossing surfaces connect all parts; different colours keep 1/5000 of the size apart."""
+def test_all_parts_are_connected_and_no_faces_coincide(class_name):
+    """Brute force: intersections connect all parts; faces of different colours are 1/5000 of the size apart."""
     for seed in SEEDS:
         parts = assemble(class_name, seed)
         groups = islands(parts)
@@ -47,8 +47,8 @@ def test_nothing_floats_and_nothing_flickers(class_name):
         assert not fighting(parts, 2e-4 * size), seed
 
 
-def test_the_brute_force_sees_gaps_nesting_and_flicker():
-    """By hand: boxes side by side with a gap, one inside the other, and a plate flush with a face."""
+def test_the_brute_force_finds_gaps_nesting_and_coincident_faces():
+    """By hand: boxes with a gap between them, one box inside another, and a plate level with a face."""
     from data_gen.shapes.materials import plain
     from data_gen.shapes.parts import Part
     from data_gen.shapes.primitives import box
@@ -65,7 +65,7 @@ def test_the_brute_force_sees_gaps_nesting_and_flicker():
 
 
 @pytest.mark.parametrize("class_name", KINDS)
-def test_scene_is_one_textured_mesh_of_modest_size(class_name):
+def test_a_scene_is_one_textured_mesh_of_limited_size(class_name):
     for seed in SEEDS:
         scene = make(class_name, seed)
         assert list(scene.geometry) == [class_name]
@@ -81,14 +81,14 @@ def test_scene_is_one_textured_mesh_of_modest_size(class_name):
         assert mesh.volume == pytest.approx(sum(p.solid.volume for p in assemble(class_name, seed)), rel=1e-3)
 
 
-def test_no_two_are_alike():
-    """Hashes of vertices, faces, normals, texture coordinates and pixels."""
+def test_no_two_objects_are_equal():
+    """By hashes of vertices, faces, normals, texture coordinates and pixels."""
     digests = [digest(make(class_name, seed)) for class_name in CLASSES for seed in (*SEEDS, 8, 256, 65536)]
     assert len(set(digests)) == len(digests)
 
 
-def test_a_further_class_leaves_the_bytes_of_the_others():
-    """Hashes of objects as they were before there were random ones; another numpy may draw other numbers."""
+def test_random_objects_did_not_change_objects_of_the_other_classes():
+    """Hashes of objects from before there were random ones. Another numpy may draw other numbers."""
     expected = {"car": "b1bfc036", "chair": "c041a84d", "plane": "e1c27eb6", "lamp": "5317c6c7"}
     assert {name: digest(make(name, 3))[:8] for name in KINDS} == expected
 
@@ -104,8 +104,8 @@ def test_two_processes_make_the_same_bytes():
     assert done.stdout.split() == [digest(make(name, 3)) for name in CLASSES]
 
 
-def test_frame_is_y_up_and_front_along_z():
-    """By name of the parts: lamps of cars, backs and seats of chairs, fins of planes; feet and tyres on y = 0."""
+def test_y_is_up_and_the_front_is_along_z():
+    """By names of parts: lamps of cars, backs and seats of chairs, fins of planes. Feet and tyres are at y = 0."""
     for seed in SEEDS:
         car = {part.name: part.solid.vertices for part in assemble("car", seed)}
         assert car["left_headlamp"][:, 2].mean() > 1 > -1 > car["left_tail_lamp"][:, 2].mean()
@@ -129,6 +129,6 @@ def test_wrong_arguments_are_named():
         make("car", -1)
 
 
-def test_importing_the_package_stays_light():
+def test_importing_the_package_loads_little():
     code = "import sys, data_gen; sys.exit('trimesh' in sys.modules or 'PIL' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=Path(__file__).parents[3]).returncode == 0

@@ -1,4 +1,4 @@
-"""Sources of truth: trimesh's reading of textures at texture coordinates, pixels compared by hand, unit normals."""
+"""Sources of truth: trimesh's colours at texture coordinates, pixels by hand, and unit normals."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from data_gen.shapes.primitives import ball, box, cylinder
 
 
 def _pixel(image, uv):
-    """Nearest pixel at a texture coordinate, v upwards."""
+    """The pixel nearest to texture coordinates, with v up."""
     height, width = image.shape[:2]
     return image[int((1 - uv[1]) * height), int(uv[0] * width)]
 
 
-def test_atlas_keeps_every_colour_where_the_map_says():
-    """By hand: corners of a pattern and the middle of a plain block, read back through the affine maps."""
+def test_the_atlas_has_each_colour_at_the_mapped_coordinates():
+    """By hand: corners of a pattern and the centre of a plain block, read through the affine maps."""
     rng = np.random.default_rng(0)
     noise = [
         Material("noise", rng.integers(0, 255, (h, w, 3), dtype=np.uint8)) for h, w in ((64, 64), (56, 224), (112, 112))
@@ -34,7 +34,7 @@ def test_atlas_keeps_every_colour_where_the_map_says():
 
 
 def test_plain_colours_cannot_bleed():
-    """Property: a plain colour is surrounded by itself for seven pixels, and all corners of a face read one point."""
+    """Property: a plain colour has a margin of seven pixels, and all corners of a face have the same coordinates."""
     image, maps = atlas([plain((200, 10, 10)), plain((10, 200, 10))])
     for mapping, colour in zip(maps, ((200, 10, 10), (10, 200, 10)), strict=True):
         assert (mapping[:, 0] == 0).all()
@@ -42,8 +42,8 @@ def test_plain_colours_cannot_bleed():
         assert (image[y - 7 : y + 7, x - 7 : x + 7] == colour).all()
 
 
-def test_scene_shows_each_part_in_its_material():
-    """Other implementation: trimesh's own conversion of the texture to vertex colours."""
+def test_each_part_of_a_scene_has_the_colours_of_its_material():
+    """Other implementation: trimesh's conversion of the texture to vertex colours."""
     red, green, blue = plain((200, 20, 20)), plain((20, 200, 20)), plain((20, 20, 200))
     parts = [
         Part.of("left_box", box(1, 1, 1), red).capped(green, first=False),
@@ -70,7 +70,7 @@ def test_scene_shows_each_part_in_its_material():
 
 
 def test_normals_are_flat_across_creases_and_smooth_within():
-    """Closed forms: a box's corners take its faces' normals; a ball's approach the direction from its centre."""
+    """Closed forms: corners of a box have the normals of its faces; normals of a ball point away from its centre."""
     cube = box(1, 1, 1)
     np.testing.assert_allclose(corner_normals([cube]), np.repeat(cube.mesh().face_normals[:, None], 3, 1), atol=1e-12)
     sphere = ball(1, 1, 1, 32, 16)
@@ -79,8 +79,8 @@ def test_normals_are_flat_across_creases_and_smooth_within():
 
 
 @pytest.mark.parametrize("pattern", [*patterns.PRINTS, patterns.print_of])
-def test_prints_repeat_seamlessly_around_and_depend_on_the_generator_only(pattern):
-    """Property: along u the last column continues into the first as any column does into the next."""
+def test_prints_repeat_seamlessly_and_depend_only_on_the_generator(pattern):
+    """Property: along u, the last and the first column differ as any two neighbouring columns do."""
     for seed in range(6):
         first, second = (pattern(np.random.default_rng(seed), (200, 30, 30), (30, 30, 200)) for _ in range(2))
         np.testing.assert_array_equal(first.image, second.image)
@@ -91,8 +91,8 @@ def test_prints_repeat_seamlessly_around_and_depend_on_the_generator_only(patter
         assert seam <= steps.max() + 1
 
 
-def test_textures_vary_and_stay_near_their_colour():
-    """Statistics: the mean of wood and of weave is within the stated shades of the colour, and they are not flat."""
+def test_textures_vary_around_their_colour():
+    """Statistics: the means of wood and weave are within the stated shades of the colour, and pixels vary."""
     colour = (160, 100, 60)
     for texture in (
         patterns.wood(np.random.default_rng(2), colour, 3),

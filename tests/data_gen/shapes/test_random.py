@@ -1,4 +1,4 @@
-"""What random compositions promise. Sources of truth: trimesh's topology and volume, closed forms, statistics."""
+"""Properties of random compositions. Sources of truth: trimesh's topology and volume, closed forms, statistics."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def upright(height, stations):
     return np.stack([np.zeros(stations), np.linspace(0, height, stations), np.zeros(stations)], axis=1)
 
 
-def test_compositions_are_watertight_and_no_two_parts_have_one_name():
+def test_compositions_are_watertight_and_names_of_parts_are_unique():
     for seed in range(12):
         parts = assemble("random", seed)
         assert len({part.name for part in parts}) == len(parts)
@@ -46,7 +46,7 @@ def test_compositions_are_watertight_and_no_two_parts_have_one_name():
 
 
 @pytest.mark.parametrize("make", PRIMITIVES, ids=lambda make: make.__name__)
-def test_every_primitive_is_closed_right_way_out_and_fits_the_cube(make):
+def test_every_primitive_is_closed_oriented_outwards_and_fits_the_cube(make):
     for seed in range(4):
         for fine in (False, True) if make not in FRAMES else (False,):
             solid = make(np.random.default_rng(seed), fine)
@@ -55,7 +55,7 @@ def test_every_primitive_is_closed_right_way_out_and_fits_the_cube(make):
 
 
 @pytest.mark.parametrize("make", STRUCTURES, ids=lambda make: make.__name__)
-def test_every_structure_is_of_closed_solids(make):
+def test_every_structure_has_closed_solids(make):
     for seed in range(3):
         solids = make(np.random.default_rng(seed))
         assert len(solids) > 1
@@ -63,8 +63,8 @@ def test_every_structure_is_of_closed_solids(make):
             check_solid(solid, (seed, number))
 
 
-def test_a_cut_keeps_the_texture_of_what_is_left_and_names_what_is_new():
-    """Closed form: a quarter cut off a cube, the new faces in the cutting planes and no others."""
+def test_a_cut_keeps_the_texture_of_old_faces_and_names_new_ones():
+    """Closed form: a quarter is cut off a cube. Only the new faces are in the cutting planes."""
     cube, tool = box(2, 2, 2), box(2, 2, 3).moved(1, 1)
     left = difference(cube, tool)
     check_solid(left, "cut")
@@ -104,7 +104,7 @@ def test_the_same_seed_gives_the_same_vertices_and_pixels():
             np.testing.assert_array_equal(one, other)
 
 
-def test_parts_of_two_finishes_are_two_geometries_with_one_texture():
+def test_parts_with_two_materials_are_two_geometries_with_one_texture():
     matt = Part.of("matt", box(1, 1, 1), plain((200, 20, 20)))
     glossy = Part("glossy", box(1, 1, 1).moved(2), (plain((20, 20, 200)),), np.zeros(12, np.int64), Finish(0.35, 0.3))
     scene = build_scene("thing", [matt, glossy, Part.of("other", box(1, 1, 1).moved(4), plain((1, 2, 3)))])
@@ -118,15 +118,15 @@ def test_parts_of_two_finishes_are_two_geometries_with_one_texture():
 
 
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
-def test_photographs_are_those_whose_documentation_frees_them(name):
-    """Source: scikit-image's own docstrings, which state the licence of each picture."""
+def test_photographs_have_a_free_licence_by_their_documentation(name):
+    """Source of truth: scikit-image's docstrings, which state the licence of each picture."""
     import skimage.data
 
     text = " ".join((getattr(skimage.data, name).__doc__ or "").split())
     assert "CC0" in text or "Creative Commons CC0" in text or "public domain" in text.lower()
 
 
-def test_glyphs_are_drawn_in_one_stroke():
+def test_glyphs_are_connected():
     """Brute force: all pixels of a glyph are connected through their sides."""
     from scipy.ndimage import label
 
@@ -135,7 +135,7 @@ def test_glyphs_are_drawn_in_one_stroke():
 
 
 def test_tubes_have_the_volumes_of_prisms_pyramids_and_rings():
-    """Closed forms: base times height, a third of it, and Pappus' rule for a ring of many corners."""
+    """Closed forms: base times height, a third of it, and Pappus' theorem for a ring of many corners."""
     square = subdivided(rectangle(2.0, 2.0), AROUND)
     assert tube(upright(3.0, 5), np.tile(square, (5, 1, 1))).volume == pytest.approx(12)
     shrinking = np.linspace(1, 0, 5)[:, None, None] * square
@@ -147,8 +147,8 @@ def test_tubes_have_the_volumes_of_prisms_pyramids_and_rings():
     check_solid(ring, "ring")
 
 
-def test_frames_follow_a_curve_without_a_jump():
-    """Property: rotations whose last column is the direction, and that of a closed curve ends as it begins."""
+def test_frames_along_a_curve_are_continuous():
+    """Property: frames are rotations with the direction as last column; on closed curves, the last equals the first."""
     angles = np.arange(60) * (2 * np.pi / 60)
     knot = np.stack([np.cos(angles), 0.4 * np.sin(2 * angles), np.sin(angles) + 0.3 * np.cos(3 * angles)], axis=1)
     frames = frames_along(knot, closed=True)
@@ -160,7 +160,7 @@ def test_frames_follow_a_curve_without_a_jump():
 
 
 def test_a_height_field_moves_along_the_normal():
-    """Closed form: a ball of many faces that is raised everywhere by a tenth has 1.331 times the volume."""
+    """Closed form: a ball of many faces that is raised by a tenth everywhere has 1.331 times the volume."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 41)
     spine = np.stack([0 * angles, np.sin(angles), 0 * angles], axis=1)
     radii = np.cos(angles)
@@ -172,15 +172,15 @@ def test_a_height_field_moves_along_the_normal():
     check_solid(raised, "raised")
 
 
-def test_a_reflection_keeps_a_solid_the_right_way_out():
+def test_a_reflected_solid_is_oriented_outwards():
     solid = next(iter(PRIMITIVES))(np.random.default_rng(0), True)
     flipped = moved(solid, np.diag([1.0, -0.5, 1.0]), np.array([3.0, 0.0, 0.0]))
     check_solid(flipped, "reflected")
     assert flipped.volume == pytest.approx(0.5 * solid.volume)
 
 
-def test_outlines_are_simple_and_fill_their_square():
-    """Brute force: seen from the mean of the corners, the angle to the next corner always grows."""
+def test_outlines_do_not_intersect_themselves_and_fill_their_square():
+    """Brute force: from the mean of the corners, the angle always increases to the next corner."""
     for seed in range(80):
         corners, _ = outline(np.random.default_rng(seed))
         assert corners.shape == (AROUND, 2)

@@ -1,4 +1,4 @@
-"""Sources of truth: closed forms of volumes, trimesh's own volume and topology checks, the shoelace formula."""
+"""Sources of truth: closed forms of volumes, trimesh's volume and topology checks, and the shoelace formula."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SOLIDS: dict[str, Solid] = {
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_solid_is_closed_right_way_out_and_of_the_volume_it_claims(name):
+def test_every_solid_is_closed_oriented_outwards_and_has_its_stated_volume(name):
     solid = SOLIDS[name]
     for moved in (solid, solid.mirrored(), solid.moved(1, 2, 3).turned("x", 40), solid.scaled(2, 3, 0.5)):
         mesh = moved.mesh()
@@ -55,7 +55,7 @@ def test_solid_is_closed_right_way_out_and_of_the_volume_it_claims(name):
         assert moved.uv.max() <= 1 + 1e-12
 
 
-def test_volumes_of_the_textbook():
+def test_volumes_are_those_of_the_closed_forms():
     """Closed forms; a regular n-gon of circumradius r has the area n / 2 sin(2 pi / n) r^2."""
 
     def gon(n: int, r: float) -> float:
@@ -66,18 +66,18 @@ def test_volumes_of_the_textbook():
     assert make.cone(1, 0, 2, 9).volume == pytest.approx(gon(9, 1) * 2 / 3)
     assert make.cone(1, 0.4, 2, 9).volume == pytest.approx(gon(9, 1) * 2 / 3 * (1 + 0.4 + 0.16))
     assert make.torus(2, 0.5, 20, 8).volume == pytest.approx(20 * np.sin(np.pi / 10) * 2 * gon(8, 0.5))  # Pappus
-    # prismatoid over two rectangles: h / 6 (A0 + 4 Am + A1), the middle one 0.75 x 1.35
+    # a prismatoid over two rectangles: h / 6 (A0 + 4 Am + A1), where the middle rectangle is 0.75 x 1.35
     assert make.tapered((1, 2), (0.5, 0.7), 3).volume == pytest.approx(3 / 6 * (2 + 4 * 0.75 * 1.35 + 0.35))
     assert make.rod((0, 0, 0), (2, 3, 6), 0.1, 0.2, 4).volume == pytest.approx(0.02 * 7)
-    # an L of a square bar: the mitre adds on one side what it takes on the other
+    # an L of a square bar: the mitre adds the volume on one side that it removes on the other
     assert make.tube([(0, 0, 0), (0, 1, 0), (2, 1, 0)], 0.1, sides=4).volume == pytest.approx(0.01 * 3)
-    # the arrow (0, 0), (2, 1), (0, 2), (1, 1) is the triangle of area 2 less the notch of area 1
+    # the arrow (0, 0), (2, 1), (0, 2), (1, 1) is the triangle of area 2 minus the notch of area 1
     arrow = np.array([(0, 0), (2, 1), (0, 2), (1, 1)])
     assert loft([arrow, arrow], [0, 3]).volume == pytest.approx(3 * (2 - 1))
 
 
-def test_ball_approaches_the_sphere():
-    """Property: the inscribed polyhedron grows towards 4/3 pi abc, quadratically in the number of facets."""
+def test_the_volume_of_a_ball_converges_to_that_of_the_sphere():
+    """Property: the inscribed polyhedron converges to 4/3 pi abc, quadratically in the number of facets."""
     exact = 4 / 3 * np.pi * 6
     coarse, fine = (exact - make.ball(1, 2, 3, 8 * k, 4 * k).volume for k in (4, 8))
     assert 0 < fine < coarse
@@ -96,7 +96,7 @@ def test_ball_approaches_the_sphere():
     ],
 )
 def test_outline_is_counter_clockwise_and_triangles_tile_it(outline):
-    """Property: the areas of the triangles, all positive, add up to the shoelace area."""
+    """Property: the areas of the triangles are positive and sum to the area by the shoelace formula."""
     areas = np.array([polygon_area(outline[triangle]) for triangle in triangulate(outline)])
     assert (areas > 0).all()
     assert areas.sum() == pytest.approx(polygon_area(outline))
@@ -109,7 +109,7 @@ def test_outline_areas():
     assert polygon_area(rounded_rectangle(2, 3, 0.4, 200)) == pytest.approx(6 - (4 - np.pi) * 0.16, rel=1e-5)
     assert polygon_area(superellipse(2, 2, 2, 16)) == pytest.approx(polygon_area(ellipse(1, 1, 16)))
     assert airfoil(3, 0.3)[:, 0].max() == pytest.approx(3)
-    # the NACA law's largest thickness is the nominal one
+    # the largest thickness by the NACA formula is the nominal one
     assert np.ptp(airfoil(1, 0.12, 100)[:, 1]) == pytest.approx(0.12, rel=2e-3)
 
 
@@ -122,13 +122,13 @@ def test_axes_of_a_loft():
 
 
 def test_rotation_is_right_handed():
-    """By hand: a quarter turn about each axis carries the next axis to the one after."""
+    """By hand: a rotation by 90 degrees about each axis maps the next axis to the one after it."""
     for axis, start, end in (("x", 1, 2), ("y", 2, 0), ("z", 0, 1)):
         np.testing.assert_allclose(rotation(axis, 90) @ np.eye(3)[start], np.eye(3)[end], atol=1e-12)
 
 
 def test_projection_and_repetition_of_texture_coordinates():
-    """By hand: a box seen along z, and a cylinder whose texture goes around it three times."""
+    """By hand: a box projected along z, and a cylinder with three repetitions of its texture around it."""
     solid = make.box(2, 4, 6).projected("z")
     corner = solid.vertices[solid.faces]
     np.testing.assert_allclose(solid.uv, (corner[..., :2] + (1, 2)) / (2, 4))
