@@ -29,6 +29,7 @@ from hyperplanes.data.pictures.images import (
 from hyperplanes.data.pictures.masks import match_masks
 from hyperplanes.utilities.errors import listed
 from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.formatting import counted
 
 __all__ = ["FEWEST", "Photograph", "find_photographs", "list_photographs", "read_upright", "without_copies"]
 
@@ -92,8 +93,8 @@ def find_photographs(folder: Path) -> list[Path]:
         )
     found = sorted(heif + [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES], key=_natural)
     if len(found) < FEWEST:
-        count = f"{len(found)} photographs" if len(found) != 1 else "1 photograph"
-        raise DataError(folder, f"at least {FEWEST} photographs of one object", count, _elsewhere(folder))
+        wanted = f"at least {FEWEST} photographs of one object"
+        raise DataError(folder, wanted, counted(len(found), "photograph"), _elsewhere(folder))
     return found
 
 

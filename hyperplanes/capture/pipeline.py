@@ -33,6 +33,7 @@ from hyperplanes.utilities.arguments import checked_fields
 from hyperplanes.utilities.encoding import encode_jpeg, encode_png, sha256
 from hyperplanes.utilities.errors import listed
 from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.formatting import counted
 from hyperplanes.utilities.writing import write_whole
 
 __all__ = ["Captured", "Progress", "Settings", "capture"]
@@ -112,7 +113,7 @@ def capture(
     kept = [photographs[index] for index in model.pictures]
     if len(kept) < len(photographs):
         rest = [one.name for index, one in enumerate(photographs) if index not in set(model.pictures.tolist())]
-        work.notes.append(f"{len(rest)} photographs could not be posed and are left out: {listed(rest)}")
+        work.notes.append(f"{counted(len(rest), 'photograph')} could not be posed and left out: {listed(rest)}")
     straight, given = _straight(model, pictures, opacities, work)
     masks, how = _masks(model, straight, given, [one.name for one in kept], work)
     placement, masks = _placed(model, kept, straight, masks, given, work)
@@ -307,7 +308,7 @@ def _masks(
         return [opacity / 255.0 for opacity in given if opacity is not None], "given"
     masker, how = choose_masker(work.settings.mask, model, straight)
     if len(bare) < len(given):
-        work.notes.append(f"{len(bare)} photographs came without a mask and get one by {how}: {listed(bare)}")
+        work.notes.append(f"{counted(len(bare), 'photograph')} without a mask, made by {how}: {listed(bare)}")
     key = fingerprint(work.stages.key("poses"), how)
     work.stages.begin("masks", key)
     folder = work.stages.folder / "masks"
@@ -346,9 +347,11 @@ def _placed(
         own = [opacity is not None for opacity in given]
         pictures = None if all(own) or not is_installed("cv2") else straight
         found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius), pictures)
-        for kept, done in ((True, "check them"), (False, "they were corrected by what the others show")):
+        for kept, done in ((True, "to be checked"), (False, "corrected by what the others show")):
             if names := [photographs[row].name for row in found.wrong if own[row] == kept]:
-                work.notes.append(f"{len(names)} masks contradict the others, {done}: {listed(names)}")
+                work.notes.append(
+                    f"{counted(len(names), 'mask')} in contradiction to the others, {done}: {listed(names)}"
+                )
         work.progress("agreement", 1, 1, f"{1 - float(found.disagreement.mean()):.1%} of their area")
         masks = [mask if kept else other for mask, other, kept in zip(masks, found.masks, own, strict=True)]
         sphere = found.sphere or sphere

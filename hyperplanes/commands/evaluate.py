@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, ViewsUp, check_fine_tune, optional
 from hyperplanes.commands.writing import check_output
+from hyperplanes.utilities.formatting import counted
 
 if TYPE_CHECKING:
     from hyperplanes.data import Dataset
@@ -216,7 +217,7 @@ def run(arguments: Arguments) -> int:
     console.table(headings(scores), rows(scores))
     if count > 1 and pairs:
         console.table(PAIR_HEADINGS, compared_rows(pairs[:LARGEST_TABLE]))
-    console.say(f"{count} objects of {arguments.data}{_of_seeds(arguments)}")
+    console.say(f"{counted(count, 'object')} of {arguments.data}{_of_seeds(arguments)}")
     if line := _of_shown(scores):
         console.warn(line)
     _write(arguments, scores, pairs)
@@ -331,7 +332,7 @@ def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Compar
     if arguments.csv is not None:
         write_whole(arguments.csv, tables.as_csv(scores).encode())
     if arguments.markdown is not None:
-        about = f"{len(scores[0].objects)} objects of {arguments.data}{_of_seeds(arguments)}."
+        about = f"{counted(len(scores[0].objects), 'object')} of {arguments.data}{_of_seeds(arguments)}."
         if line := _of_shown(scores):
             about += f" Caution: {line}."
         write_whole(arguments.markdown, tables.as_markdown(scores, pairs, about).encode())

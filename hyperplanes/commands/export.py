@@ -102,6 +102,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.mesh import check_voxels
     from hyperplanes.export.page import page_of, save_page, turning_picture
     from hyperplanes.utilities.errors import rename_errors
+    from hyperplanes.utilities.formatting import counted
     from hyperplanes.utilities.writing import write_whole
 
     if not arguments.what:
@@ -164,7 +165,7 @@ def run(arguments: Arguments) -> int:
         with rename_errors("count", "--points"):
             cloud = point_cloud(pictures, shown.cameras, bounds, arguments.points)
         path = save_points(cloud, out / "points.ply")
-        console.say(f"{path}: {len(cloud):,} points with normals and colours, of {len(shown)} views")
+        console.say(f"{path}: {len(cloud):,} points with normals and colours, of {counted(len(shown), 'view')}")
     if {"page", "splats"} & set(arguments.what):
         if isinstance(field, AdaptedField):
             side = arguments.page_voxels or default_side(shown.size)

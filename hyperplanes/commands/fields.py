@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from hyperplanes.commands.writing import keep_if_possible
-from hyperplanes.utilities.formatting import format_duration
+from hyperplanes.utilities.formatting import counted, format_duration
 
 if TYPE_CHECKING:
     import torch
@@ -129,7 +129,7 @@ def adapt_to(
     folder = kept_folder(source, shown, steps, settings)
     kept = recall_field(folder, shown, shown.images.device)
     if kept is not None:
-        console.say(f"{name}: adapted to these {len(shown)} views before; read from {folder}")
+        console.say(f"{name}: adapted to the same views before; read from {folder}")
         return kept, warned
     with console.bar("fine-tuning") as bar:
 
@@ -158,7 +158,7 @@ def adapt_to(
         beside = "the field before gradient steps" if isinstance(rendered, AveragedField) else "hull_blend"
         how += f", averaged with {beside}"
     seconds = format_duration(time.perf_counter() - started)
-    console.say(f"adapted to {len(shown)} views of {name} in {seconds}{how}")
+    console.say(f"adapted to {counted(len(shown), 'view')} of {name} in {seconds}{how}")
     return field, warned
 
 
@@ -222,6 +222,6 @@ def bake_field(
         with console.bar("fitting voxels") as bar:
             guide = render_guide(field, shown)
             baked = fit_voxels(baked, shown, guide=guide, steps=fit, on_step=lambda done: show(bar, done, fit, "steps"))
-        how += f", fitted to {len(shown)} views in {format_duration(time.perf_counter() - between)}"
+        how += f", fitted to {counted(len(shown), 'view')} in {format_duration(time.perf_counter() - between)}"
     console.say(how)
     return baked

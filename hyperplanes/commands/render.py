@@ -36,7 +36,7 @@ from hyperplanes.commands.options import (
 )
 from hyperplanes.commands.scene import read_object, read_path, refuse_sources
 from hyperplanes.commands.writing import writes_to
-from hyperplanes.utilities.formatting import format_duration
+from hyperplanes.utilities.formatting import counted, format_duration
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -182,7 +182,7 @@ def run(arguments: Arguments) -> int:
     if older := sorted({path.name for path in arguments.out.glob("*.png")} - {path.name for path in paths}):
         console.warn(f"{arguments.out}: pictures that this command did not write are there: {listed(older)}")
     how = " corrected by residuals" if corrected else ""
-    console.say(f"{arguments.out}: {len(paths)} pictures{how}, {format_duration(seconds)} a view")
+    console.say(f"{arguments.out}: {counted(len(paths), 'picture')}{how}, {format_duration(seconds)} a view")
     return 0
 
 

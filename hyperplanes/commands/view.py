@@ -31,6 +31,7 @@ from hyperplanes.commands.console import Console
 from hyperplanes.commands.fields import bake_field, load_source, refuse_of_baked
 from hyperplanes.commands.options import ViewsArguments
 from hyperplanes.commands.scene import prepare_task, read_scene
+from hyperplanes.utilities.formatting import counted
 from hyperplanes.utilities.interrupts import Terminated
 
 if TYPE_CHECKING:
@@ -204,7 +205,7 @@ def _adapt(
     from hyperplanes.adaptation.context import trained_on
     from hyperplanes.export.baking import BakedScene, default_side
 
-    console.say(f"adapting to {len(shown)} views")
+    console.say(f"adapting to {counted(len(shown), 'view')}")
     model = model.without_residuals()  # correction would take too long for an interactive page
     placed, steps = to_canonical_frame(model, shown), arguments.steps if len(shown) > 1 else 0
     context, field = placed.context(model), None
@@ -216,4 +217,7 @@ def _adapt(
     if arguments.fit and field is not None:
         side, check = default_side(shown.size), partial(_check, wanted)
         baked = bake_field(field, shown, side, fit=arguments.fit, console=console, check=check)
-        viewer.show(BakedScene(baked), f"{len(shown)} support views, {steps} steps, {len(baked.values):,} baked voxels")
+        viewer.show(
+            BakedScene(baked),
+            f"{counted(len(shown), 'support view')}, {counted(steps, 'step')}, {len(baked.values):,} baked voxels",
+        )

@@ -1,8 +1,8 @@
-"""Durations and rates as text."""
+"""Durations, rates and counts as text."""
 
 from __future__ import annotations
 
-__all__ = ["format_duration", "format_rate"]
+__all__ = ["counted", "format_duration", "format_rate"]
 
 
 def format_duration(seconds: float) -> str:
@@ -32,3 +32,12 @@ def format_rate(value: float) -> str:
     if value < 999_950:
         return f"{value / 1e3:.1f}k"
     return f"{value / 1e6:.1f}M"
+
+
+def counted(count: int, noun: str) -> str:
+    """A number and its noun.
+
+    >>> counted(1, "view"), counted(3, "view")
+    ('1 view', '3 views')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

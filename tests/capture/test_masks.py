@@ -166,8 +166,8 @@ def test_given_masks_are_not_changed_and_others_are_corrected(ball_seen, tmp_pat
     for row in range(8):
         np.testing.assert_array_equal(found[row], damaged[row])
     assert overlap(found[9], masks[9] > 0.5) > 0.9
-    corrected = "they were corrected by what the others show"
-    said = [f"1 masks contradict the others, {done}" for done in ("check them: 2", f"{corrected}: 9")]
+    corrected = "corrected by what the others show"
+    said = [f"1 mask in contradiction to the others, {done}" for done in ("to be checked: 2", f"{corrected}: 9")]
     assert [note for note in captured.notes if "contradict" in note] == said
 
 

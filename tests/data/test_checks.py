@@ -141,7 +141,7 @@ def test_one_picture_in_support_and_query_is_found(scene, tmp_path):
     (home / "transforms.json").write_text(json.dumps(document))
     found = describe(home).lines()
     assert any("2 of 8 poses have the picture of another pose (images/000.png and images/003.png" in s for s in found)
-    assert f"{home.name}: 1 frames left out, whose images earlier frames list: images/005.png" in found
+    assert f"{home.name}: 1 frame left out, whose images earlier frames list: images/005.png" in found
 
 
 def test_splits_with_different_world_coordinates_are_found(scene):

@@ -124,7 +124,7 @@ def test_pictures_of_several_sizes_are_scaled_to_one(scene, tmp_path):
         with Image.open(tmp_path / name) as image:
             large = image.resize((96, 72), Image.Resampling.BICUBIC)
         large.save(tmp_path / name)
-    with pytest.warns(UserWarning, match="2 images of other sizes scaled to 32 x 24 pixels"):
+    with pytest.warns(UserWarning, match="2 images of another size, scaled to 32 x 24 pixels"):
         views = read_views(folder)
     assert len(views) == 8
     assert max(balls(views, views.masks[:, 0] > 0.5)) < 0.6
@@ -137,7 +137,7 @@ def test_portraits_among_landscapes_keep_their_geometry(scene, tmp_path):
     upright = type(scene)(size=(40, 30))
     for at in (0, 4, 6):
         Image.fromarray(upright.pictures[at]).save(tmp_path / scene.names[at])
-    with pytest.warns(UserWarning, match="3 images of other sizes scaled to 32 x 24 pixels"):
+    with pytest.warns(UserWarning, match="3 images of another size, scaled to 32 x 24 pixels"):
         views = read_views(folder)
     focal = camera.intrinsics(views.cameras)[:, [0, 1], [0, 1]].numpy()
     np.testing.assert_allclose(focal[1], scene.matrix[0, 0], rtol=1e-6)

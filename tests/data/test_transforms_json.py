@@ -180,9 +180,9 @@ def test_no_picture_is_in_both_support_and_query(scene, tmp_path):
         (tmp_path / f"files/transforms_{half}.json").write_text(json.dumps(document | {"frames": frames}))
     (tmp_path / "files/transforms.json").unlink()
     for folder, support, query, note in (
-        ("lists", names[:5], names[5:], f"1 frames left out, whose images earlier frames list: {names[4]}"),
+        ("lists", names[:5], names[5:], f"1 frame left out, whose images earlier frames list: {names[4]}"),
         ("twice", names[::2], names[1::2], f"8 frames left out, whose images earlier frames list: {', '.join(names)}"),
-        ("files", names[:6], names[6:], "1 frames left out, whose images earlier frames list: images/link.png"),
+        ("files", names[:6], names[6:], "1 frame left out, whose images earlier frames list: images/link.png"),
     ):
         task = read_posed_task(tmp_path / folder)
         assert (task.support.names, task.query.names) == (tuple(support), tuple(query))

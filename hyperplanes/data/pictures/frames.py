@@ -28,6 +28,7 @@ from hyperplanes.data.pictures.undistort import check_lens, undistort
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.errors import listed
 from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.formatting import counted
 
 __all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "centred_matrix", "scaled_matrix"]
 
@@ -128,9 +129,11 @@ def assemble(listing: Listing, downscale: int | None = None, *, complete: bool =
     found = [_examine(frames[index], source) for index in kept]
     size = _common_size([one.size for one in found])
     if scaled := [one.frame.name for one in found if one.size != size]:
-        notes.append(f"{len(scaled)} images of other sizes scaled to {size[1]} x {size[0]} pixels: {listed(scaled)}")
+        notes.append(
+            f"{counted(len(scaled), 'image')} of another size, scaled to {size[1]} x {size[0]} pixels: {listed(scaled)}"
+        )
     if turns := [one.frame.name for one in found if one.turn != 1]:
-        notes.append(f"{len(turns)} images rotated by their EXIF orientation: {listed(turns)}")
+        notes.append(f"{counted(len(turns), 'image')} rotated by their EXIF orientation: {listed(turns)}")
     factor = _factor(size, downscale, complete, source)
     if factor > 1:
         why = "" if downscale else "; --downscale 1 keeps every pixel"
@@ -186,7 +189,7 @@ def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tup
         first.setdefault(frames[index].path.resolve(), index)
     kept = list(first.values())
     if again := [frames[index].name for index in sorted({*there} - {*kept})]:
-        notes.append(f"{len(again)} frames left out, whose images earlier frames list: {listed(again)}")
+        notes.append(f"{counted(len(again), 'frame')} left out, whose images earlier frames list: {listed(again)}")
     return kept, notes
 
 
