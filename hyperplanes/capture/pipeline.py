@@ -113,7 +113,7 @@ def capture(
     kept = [photographs[index] for index in model.pictures]
     if len(kept) < len(photographs):
         rest = [one.name for index, one in enumerate(photographs) if index not in set(model.pictures.tolist())]
-        work.notes.append(f"{counted(len(rest), 'photograph')} could not be posed and left out: {listed(rest)}")
+        work.notes.append(f"{counted(len(rest), 'photograph')} without a pose, left out: {listed(rest)}")
     straight, given = _straight(model, pictures, opacities, work)
     masks, how = _masks(model, straight, given, [one.name for one in kept], work)
     placement, masks = _placed(model, kept, straight, masks, given, work)
@@ -308,7 +308,7 @@ def _masks(
         return [opacity / 255.0 for opacity in given if opacity is not None], "given"
     masker, how = choose_masker(work.settings.mask, model, straight)
     if len(bare) < len(given):
-        work.notes.append(f"{counted(len(bare), 'photograph')} without a mask, made by {how}: {listed(bare)}")
+        work.notes.append(f"{counted(len(bare), 'photograph')} without a mask, which is made by {how}: {listed(bare)}")
     key = fingerprint(work.stages.key("poses"), how)
     work.stages.begin("masks", key)
     folder = work.stages.folder / "masks"
