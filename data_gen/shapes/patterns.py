@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.materials import Colour, Material, brighten
 
 __all__ = ["PRINTS", "checks", "dots", "lines", "noise", "print_of", "stripes", "weave", "wheel_face", "wood"]
@@ -104,7 +105,7 @@ PRINTS = (stripes, checks, dots, lines)
 
 def print_of(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """One of the two-coloured patterns, drawn at random."""
-    return PRINTS[int(rng.integers(len(PRINTS)))](rng, first, second)
+    return one_of(rng, PRINTS)(rng, first, second)
 
 
 def wheel_face(rng: np.random.Generator) -> Material:

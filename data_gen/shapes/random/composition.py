@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_gen.shapes.parts import Part, pick
+from data_gen.shapes.choices import one_of, pick
+from data_gen.shapes.parts import Part
 from data_gen.shapes.primitives import box, cylinder
 from data_gen.shapes.random.cuts import difference
 from data_gen.shapes.random.painting import Paint
@@ -18,8 +19,8 @@ from data_gen.shapes.solids import Solid, rotation
 
 __all__ = ["COUNTS", "composition", "random_rotation"]
 
-COUNTS = (5, 5, 5, 4, 4, 3, 2, 1, 1)
-"""Relative frequencies of objects with 1, 2, ... 9 primitives."""
+COUNTS = {1: 5, 2: 5, 3: 5, 4: 4, 5: 4, 6: 3, 7: 2, 8: 1, 9: 1}
+"""Relative frequencies of objects by their number of primitives."""
 
 RELIEF = 0.5
 """Share of the primitives with a height field."""
@@ -132,7 +133,7 @@ def _arranged(rng: np.random.Generator, solid: Solid) -> Solid:
 
 def _attached(rng: np.random.Generator, solid: Solid, others: list[Solid]) -> Solid:
     """The solid moved to the outside of one of the others, most often into it a little, some apart."""
-    other = others[int(rng.integers(len(others)))]
+    other = one_of(rng, others)
     direction = rng.normal(size=3)
     if rng.random() < 0.5:
         direction = np.where(np.arange(3) == int(rng.integers(3)), rng.choice([-1.0, 1.0]), 0.1 * direction)
@@ -156,9 +157,8 @@ def _base(rng: np.random.Generator, solids: list[Solid]) -> Solid:
 
 def _composed(rng: np.random.Generator) -> list[Solid]:
     """One to nine primitives, some of them repeated."""
-    count = 1 + int(rng.choice(len(COUNTS), p=np.array(COUNTS) / sum(COUNTS)))
     solids: list[Solid] = []
-    for _ in range(count):
+    for _ in range(pick(rng, COUNTS)):
         solid = _arranged(rng, _piece(rng, thin=bool(solids)))
         solids.append(_attached(rng, solid, solids) if solids else solid)
     if rng.random() < 0.12:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_gen.shapes.parts import pick
+from data_gen.shapes.choices import pick
 from data_gen.shapes.profiles import ellipse, polygon_area, rectangle, rounded_rectangle, superellipse
 from data_gen.shapes.random.tubes import subdivided
 

@@ -6,10 +6,11 @@ arXiv 2406.09371) composes cubes, balls, cylinders, cones and tori; lathes, loft
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from data_gen.shapes.choices import pick
 from data_gen.shapes.profiles import ellipse, rectangle
 from data_gen.shapes.random.hollow import arch, pipe, vessel, wire_cage
 from data_gen.shapes.random.outlines import AROUND, blob, outline
@@ -227,19 +228,18 @@ FRAMES = (wire_box, wire_cage, grille, spring)
 """Primitives made of bars, too thin for displacement."""
 
 
-def primitive(rng: np.random.Generator, relief: float, shares: Mapping[Maker, float] = PRIMITIVES) -> Solid:
+def primitive(rng: np.random.Generator, relief: float, makers: Iterable[Maker] = PRIMITIVES) -> Solid:
     """A random primitive, its longest extent 2, about the origin.
 
     Args:
         rng: source of every choice.
         relief: probability of a height field.
-        shares: the primitives, with relative frequencies.
+        makers: the primitives to choose from; one that is not in `PRIMITIVES` is as frequent as 1.0 there.
 
     Returns:
         The solid.
     """
-    makers, weights = list(shares), np.array(list(shares.values()))
-    maker = makers[int(rng.choice(len(makers), p=weights / weights.sum()))]
+    maker = pick(rng, {maker: PRIMITIVES.get(maker, 1.0) for maker in makers})
     fine = maker not in FRAMES and bool(rng.random() < relief)
     solid = maker(rng, fine)
     if fine:

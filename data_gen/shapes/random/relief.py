@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from data_gen.shapes.parts import pick
+from data_gen.shapes.choices import pick
 from data_gen.shapes.random.tubes import signed_volume
 from data_gen.shapes.solids import Solid
 

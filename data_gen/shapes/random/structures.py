@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.primitives import box
-from data_gen.shapes.random.fillings import BODIES, LIMBS, crate, filling, one_of, sides
+from data_gen.shapes.random.fillings import BODIES, LIMBS, crate, filling, sides
 from data_gen.shapes.random.hollow import arch, vessel
-from data_gen.shapes.random.primitives import ball, bent_tube, cone, cylinder, lathe, loft, pebble, torus
+from data_gen.shapes.random.primitives import ball, bent_tube, cone, cylinder, lathe, loft, pebble, primitive, torus
 from data_gen.shapes.random.tubes import bar, merged, moved
 from data_gen.shapes.solids import Solid, rotation
 
@@ -44,7 +45,7 @@ def cart(rng: np.random.Generator) -> list[Solid]:
     radius, pairs = rng.uniform(0.18, 0.5), int(rng.integers(1, 5))
     floor = radius * rng.uniform(0.5, 1.3)
     parts = [filling(rng, BODIES, (-width, floor, -length), (width, floor + high, length))]
-    wheel = one_of(rng, (cylinder, torus, torus, lathe), 0.2)
+    wheel = primitive(rng, 0.2, (cylinder, torus, lathe))
     wheel = moved(wheel, rotation("z", 90.0) @ np.diag([1.0, rng.uniform(0.15, 0.4), 1.0]))
     wheel = moved(wheel, radius / np.abs(wheel.vertices[:, 1:]).max() * np.eye(3))
     places = np.linspace(-0.75, 0.75, pairs) * length if pairs > 1 else np.array([rng.uniform(-0.3, 0.3)])
@@ -76,7 +77,7 @@ def figure(rng: np.random.Generator) -> list[Solid]:
     parts.append(
         filling(
             rng,
-            (ball, ball, pebble, crate, lathe),
+            (ball, pebble, crate, lathe),
             (-head, neck, forward - head),
             (head, neck + 2 * head, forward + head),
             0.35,
@@ -87,7 +88,7 @@ def figure(rng: np.random.Generator) -> list[Solid]:
     x = max(0.7 * width, foot)
     parts.append(merged([sides(moved(limb, np.eye(3), np.array([x, 0.0, z]))) for z in places]))
     if rng.random() < 0.8:
-        arm = one_of(rng, (bent_tube, cylinder, loft, lathe), 0.1)
+        arm = primitive(rng, 0.1, (bent_tube, cylinder, loft, lathe))
         arm = moved(arm, np.diag([rng.uniform(0.08, 0.2), rng.uniform(0.3, 0.6), rng.uniform(0.08, 0.2)]))
         arm = moved(arm, rotation("x", rng.uniform(-90, 30)) @ rotation("z", rng.uniform(10, 100)))
         parts.append(
@@ -116,7 +117,7 @@ def house(rng: np.random.Generator) -> list[Solid]:
     for _ in range(int(rng.integers(1, 5))):
         high = rng.uniform(0.25, 1.0)
         parts.append(
-            filling(rng, (crate, crate, cylinder, loft), (-size[0], level, -size[1]), (size[0], level + high, size[1]))
+            filling(rng, (crate, cylinder, loft), (-size[0], level, -size[1]), (size[0], level + high, size[1]))
         )
         if rng.random() < 0.6:
             count, window = int(rng.integers(2, 6)), rng.uniform(0.03, 0.09)
@@ -130,7 +131,7 @@ def house(rng: np.random.Generator) -> list[Solid]:
     if rng.random() < 0.7:
         over, rise = rng.uniform(0.9, 1.4), rng.uniform(0.2, 0.9)
         low, high = (-over * size[0], level - 0.02, -over * size[1]), (over * size[0], level + rise, over * size[1])
-        parts.append(filling(rng, (cone, cone, ball, crate), low, high))
+        parts.append(filling(rng, (cone, ball, crate), low, high))
     if rng.random() < 0.35:
         steps = [box(0.8, 0.1, 0.3).moved(0, 0.05 + 0.1 * k, 1.6 - 0.16 * k) for k in range(int(rng.integers(3, 7)))]
         parts.append(merged(steps))
@@ -239,4 +240,4 @@ STRUCTURES = (table, cart, figure, house, tool, plant, machine, shelf)
 
 def structure(rng: np.random.Generator) -> list[Solid]:
     """The solids of one of `STRUCTURES`, y up."""
-    return STRUCTURES[int(rng.integers(len(STRUCTURES)))](rng)
+    return one_of(rng, STRUCTURES)(rng)
