@@ -8,8 +8,7 @@ import numpy as np
 
 from data_gen.shapes.primitives import box, cushion, tapered
 from data_gen.shapes.random.primitives import Maker, ball, cylinder, lathe, loft, pebble, primitive
-from data_gen.shapes.random.tubes import merged, moved
-from data_gen.shapes.solids import Solid
+from data_gen.shapes.solids import Solid, merged
 
 __all__ = ["BODIES", "LIMBS", "crate", "filling", "sides"]
 
@@ -34,12 +33,12 @@ def filling(
     solid = primitive(rng, relief, makers)
     bottom, top = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     scale = (np.asarray(high, dtype=float) - np.asarray(low, dtype=float)) / (top - bottom)
-    return moved(solid, np.diag(scale), np.asarray(low, dtype=float) - scale * bottom)
+    return solid.transformed(np.diag(scale), np.asarray(low, dtype=float) - scale * bottom)
 
 
 def sides(solid: Solid) -> Solid:
     """The solid and its mirror image at x = 0."""
-    return merged([solid, moved(solid, np.diag([-1.0, 1.0, 1.0]))])
+    return merged([solid, solid.mirrored()])
 
 
 def crate(rng: np.random.Generator, _fine: bool) -> Solid:

@@ -26,7 +26,7 @@ def octaves(rng: np.random.Generator, coarsest: int, count: int) -> np.ndarray:
     total, strength = np.zeros((SIZE, SIZE)), 1.0
     for octave in range(count):
         cells = min(coarsest << octave, SIZE // 2)
-        total += strength * patterns.noise(rng, (cells, cells), SIZE)
+        total += strength * patterns.noise(rng, (cells, cells))
         strength *= 0.55
     total -= total.min()
     return total / max(total.max(), 1e-9)
