@@ -7,7 +7,7 @@ import binascii
 import json
 import struct
 import urllib.parse
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from data_gen.meshes.files import MeshError
@@ -51,7 +51,7 @@ class Document:
     header: dict[str, Any]
     buffers: list[bytes]
     folder: ModelFolder
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str]
 
     @property
     def path(self) -> Any:
