@@ -295,7 +295,3 @@ class ShaderProgram:
         GL.glUniform1f(self._at("side"), side)
         GL.glUniform1f(self._at("cutoff"), -1.0 if surface.cutoff is None else surface.cutoff)
         GL.glUniform1i(self._at("layer"), layer)
-
-    def delete(self) -> None:
-        """Free the program."""
-        GL.glDeleteProgram(self.handle)
