@@ -16,12 +16,12 @@ import numpy.typing as npt
 import trimesh
 
 from data_gen.meshes.clean import check_faces, clean, decimate, is_smooth, smooth_normals
-from data_gen.meshes.dae import declared_up
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PARTS, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, read_bytes
 from data_gen.meshes.find import safe_name
+from data_gen.meshes.formats.dae import declared_up
+from data_gen.meshes.formats.read import read_scene
 from data_gen.meshes.materials import ColourSpace, canonical_visual
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.read import read_scene
 from hyperplanes.utilities.encoding import sha256
 
 __all__ = [

@@ -11,9 +11,9 @@ import trimesh
 from trimesh.visual import TextureVisuals
 
 from data_gen.meshes.files import MeshError
-from data_gen.meshes.gltf.accessors import as_numbers, read_accessor, read_numbers
-from data_gen.meshes.gltf.container import Document, not_negative
-from data_gen.meshes.gltf.materials import GltfMaterial, TextureCoordinates
+from data_gen.meshes.formats.gltf.accessors import as_numbers, read_accessor, read_numbers
+from data_gen.meshes.formats.gltf.container import Document, not_negative
+from data_gen.meshes.formats.gltf.materials import GltfMaterial, TextureCoordinates
 from data_gen.meshes.materials import EMISSIVE_UV, VERTEX_COLOUR, DrawnMaterial
 
 __all__ = ["Skinning", "read_primitive"]

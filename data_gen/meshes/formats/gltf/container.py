@@ -10,9 +10,8 @@ import urllib.parse
 from dataclasses import dataclass
 from typing import Any
 
-from data_gen.meshes.files import MeshError
+from data_gen.meshes.files import MeshError, decode_text
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.mtl import decode_text
 
 __all__ = ["Document", "not_negative", "open_document", "read_uri"]
 
