@@ -34,10 +34,9 @@ Floats = npt.NDArray[np.float64]
 _TextureKey = tuple[int, tuple[Wrap, Wrap]]
 _WRAPS = {"repeat": GL.GL_REPEAT, "clamp": GL.GL_CLAMP_TO_EDGE, "mirror": GL.GL_MIRRORED_REPEAT}
 
-_OUTER, _INNER = 1.0, -1.0
-# Drawn with flipped rows, so that glReadPixels, which starts at the bottom, returns the first row on top; the flip
-# reverses the winding of every triangle.
-_HIDDEN = {_OUTER: GL.GL_FRONT, _INNER: GL.GL_BACK}
+# Sides of faces, by what OpenGL culls to draw them. Drawn with flipped rows, so that glReadPixels, which starts at the
+# bottom, returns the first row on top; the flip reverses the winding of every triangle.
+_OUTER, _INNER = GL.GL_FRONT, GL.GL_BACK
 # COINCIDENT in steps of 24-bit depth; one step is 0.44 of it at distance 3. No offset for the slope of a face, which
 # would push inner sides behind outer ones at silhouettes.
 _OFFSET = 0.44 * COINCIDENT * 2**24
@@ -84,7 +83,6 @@ class Drawable:
             "EMISSIVE_TEXTURE": self.emissive_texture is not None,
             "TRANSLUCENT": not surface.opaque or surface.cutoff is not None,
             "UNLIT": surface.unlit,
-            "ALIGNED": _aligned(surface),
         }
         self.constants = constants_of_surface(surface)
         self.defines |= {name: 1 for name, needed in needs.items() if needed}
@@ -206,7 +204,7 @@ class SurfaceRenderer(Renderer):
         bound: ShaderProgram | None,
         view: Any,
         layer: int,
-        side: float,
+        side: int,
         *,
         culled: bool = False,
     ) -> ShaderProgram | None:
@@ -216,8 +214,8 @@ class SurfaceRenderer(Renderer):
         if count == 0:
             return bound
         program = self._bind(drawable, bound, view)
-        GL.glCullFace(_HIDDEN[side])
-        program.set_surface(drawable.surface, layer, side)
+        GL.glCullFace(side)
+        program.set_surface(drawable.surface, layer)
         for unit, texture in enumerate((drawable.base_texture, drawable.emissive_texture)):
             if texture is not None:
                 GL.glActiveTexture(int(GL.GL_TEXTURE0) + unit)
@@ -242,14 +240,6 @@ def _upload(faces: npt.NDArray[np.int64]) -> None:
 
 def _program_key(defines: dict[str, int], constants: dict[str, str]) -> tuple[Any, ...]:
     return (*sorted(defines.items()), *sorted(constants.items()))
-
-
-def _aligned(surface: ShadedSurface) -> bool:
-    """Whether all normals are on the outer side of their face, so that the shader need not check."""
-    corners = surface.positions[surface.faces]
-    facets = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    agreement = np.einsum("fi,fci->fc", facets, surface.normals[surface.faces])
-    return bool((agreement[facets.any(axis=1)] > 0.0).all())
 
 
 def _texture(
