@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -53,14 +53,14 @@ class GenerationReport:
     skipped: list[tuple[str, str]]
     seconds: float
     images_per_second: float
-    reused: int = 0
-    splits: dict[str, int] = field(default_factory=dict)
-    requested: dict[str, int] = field(default_factory=dict)
-    unlisted: list[str] = field(default_factory=list)
-    incomplete: list[str] = field(default_factory=list)
-    warned: list[str] = field(default_factory=list)
-    changed: list[str] = field(default_factory=list)
-    duplicates: list[str] = field(default_factory=list)
+    reused: int
+    splits: dict[str, int]
+    requested: dict[str, int]
+    unlisted: list[str]
+    incomplete: list[str]
+    warned: list[str]
+    changed: list[str]
+    duplicates: list[str]
 
 
 def generate(

@@ -38,8 +38,8 @@ class Inspection:
 
     description: Any
     files: tuple[Path, ...]
-    verification: Verification | None = None
-    scene: tuple[str, ...] = ()
+    verification: Verification | None
+    scene: tuple[str, ...]
 
     @property
     def has_problems(self) -> bool:
@@ -156,14 +156,14 @@ def _pictures(data: Any, names: list[str]) -> tuple[list[np.ndarray], list[str]]
     return pictures, labels
 
 
-def _cameras(views: Any, support: int, title: str, sparse: Any = None) -> bytes:
+def _cameras(views: Any, support: int, title: str, sparse: Any) -> bytes:
     """PNG of the frusta of support (blue) and query (orange) cameras around the hull, or around the bounds.
 
     Args:
         views: in a world with y up, support first.
         support: number of support views.
         title: of the picture.
-        sparse: points of a reconstruction, in the same world; those far away are left out.
+        sparse: points of a reconstruction, in the same world, or None; those far away are left out.
     """
     from hyperplanes.utilities.plots import encode_figure, new_figure
 

@@ -10,7 +10,7 @@ import os
 import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,8 +47,8 @@ class Verification:
     """
 
     files: int
-    missing: list[str] = field(default_factory=list)
-    changed: list[str] = field(default_factory=list)
+    missing: list[str]
+    changed: list[str]
 
     @property
     def intact(self) -> bool:
@@ -116,27 +116,27 @@ def verify(folder: str | Path) -> Verification:
     """Compare every file of a data set with its checksum in the manifest.
 
     Returns:
-        The missing and changed files. No manifest, or one without checksums, is a DataError.
+        The missing and changed files.
+
+    Raises:
+        DataError: if there is no manifest, or one without checksums.
     """
-    folder = Path(folder)
-    with malformed(folder / MANIFEST, "a manifest"):
-        return _verify(folder)
+    manifest = Path(folder) / MANIFEST
+    with malformed(manifest, "a manifest"):
+        objects = read_json(manifest).get("objects")
+        if not isinstance(objects, dict):
+            raise DataError(manifest, "objects with checksums", "none", "it was not made by hyperplanes generate")
+        checksums = [each for record in objects.values() for each in record.get("files", {}).items()]
+        found = [(name, _checksum(manifest.parent, name), expected) for name, expected in checksums]
+    missing = [name for name, checksum, _ in found if checksum is None]
+    changed = [name for name, checksum, expected in found if checksum not in (None, expected)]
+    return Verification(len(found), missing, changed)
 
 
-def _verify(folder: Path) -> Verification:
-    objects = read_json(folder / MANIFEST).get("objects")
-    if not isinstance(objects, dict):
-        raise DataError(folder / MANIFEST, "objects with checksums", "none", "it was not made by hyperplanes generate")
-    missing, changed, count = [], [], 0
-    for record in objects.values():
-        for name, checksum in record.get("files", {}).items():
-            count += 1
-            path = inside(folder, name, folder / MANIFEST)
-            if not path.is_file():
-                missing.append(name)
-            elif sha256(read_bytes(path)) != checksum:
-                changed.append(name)
-    return Verification(count, missing, changed)
+def _checksum(folder: Path, name: str) -> str | None:
+    """The checksum of a file that the manifest of a folder names; None if it is missing."""
+    path = inside(folder, name, folder / MANIFEST)
+    return sha256(read_bytes(path)) if path.is_file() else None
 
 
 class GenerationState:
@@ -197,16 +197,11 @@ class GenerationState:
             The record of each.
         """
         with malformed(self.out, "an unfinished data set"):
-            entries = self._entries()
             return {
                 name: entry
-                for name, entry in entries.items()
-                if all(self._is_intact(path, checksum) for path, checksum in entry["files"].items())
+                for name, entry in self._entries().items()
+                if all(_checksum(self.out, path) == checksum for path, checksum in entry["files"].items())
             }
-
-    def _is_intact(self, name: str, checksum: str) -> bool:
-        path = inside(self.out, name, self.out / MANIFEST)
-        return path.is_file() and sha256(read_bytes(path)) == checksum
 
     def _entries(self) -> dict[str, Entry]:
         entries = {}

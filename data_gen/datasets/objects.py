@@ -40,7 +40,7 @@ def open_renderer(settings: dict[str, Any]) -> Callable[[dict[str, Any]], dict[s
 
 
 def _render(renderer: Any, item: Item, config: GenerationConfig, meshes: Path | None) -> RenderedObject:
-    from data_gen.meshes.gltf import write_glb
+    from data_gen.meshes.formats.gltf import write_glb
     from data_gen.meshes.mesh import load_mesh, mesh_parts, prepare_scene
 
     if item.path is not None:

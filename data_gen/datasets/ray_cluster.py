@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Generator, Iterable
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any
 
 from data_gen.datasets.worker_process import process_item
@@ -25,8 +25,8 @@ def run_on_ray(
     items: Iterable[dict[str, Any]],
     *,
     workers: int | None,
-    timeout: float = 300.0,
-    recycle: int = 200,
+    timeout: float,
+    recycle: int,
 ) -> Generator[Outcome, None, None]:
     """Process items in Ray actors: `data_gen.datasets.workers.run_isolated` with the cluster's processors.
 
@@ -61,8 +61,7 @@ class _Actor:
     """An actor that holds the function returned by the target."""
 
     def __init__(self, target: str, settings: dict[str, Any]) -> None:
-        module, _, function = target.partition(":")
-        self._process = getattr(import_module(module), function)(settings)
+        self._process = resolve_name(target)(settings)
 
     def answer(self, item: dict[str, Any]) -> dict[str, Any]:
         return process_item(self._process, item)

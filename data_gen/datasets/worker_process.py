@@ -11,7 +11,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any
 
 from hyperplanes.utilities.files import DataError
@@ -23,10 +23,9 @@ def main() -> int:
     """Serve until the input ends."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
-    module, _, function = sys.argv[1].partition(":")
     settings = json.loads(sys.stdin.readline() or "{}")
     try:
-        process = getattr(import_module(module), function)(settings)
+        process = resolve_name(sys.argv[1])(settings)
         answers.write(json.dumps({"ready": True}) + "\n")
         for line in iter(sys.stdin.readline, ""):
             answers.write(json.dumps(process_item(process, json.loads(line))) + "\n")

@@ -96,8 +96,8 @@ def run_isolated(
     items: Iterable[dict[str, Any]],
     *,
     workers: int,
-    timeout: float = 300.0,
-    recycle: int = 200,
+    timeout: float,
+    recycle: int,
 ) -> Generator[Outcome, None, None]:
     """Process items in worker processes of this machine.
 

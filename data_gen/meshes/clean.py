@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 from scipy.spatial import KDTree
+from trimesh.grouping import unique_rows
 from trimesh.visual import ColorVisuals, TextureVisuals
 
 from data_gen.meshes.materials import select_vertices, visual_of
@@ -39,7 +40,7 @@ def check_faces(mesh: trimesh.Trimesh, label: str) -> None:
 
 
 def clean(
-    mesh: trimesh.Trimesh, label: str, parts: Sequence[trimesh.Trimesh] = ()
+    mesh: trimesh.Trimesh, label: str, parts: Sequence[trimesh.Trimesh]
 ) -> tuple[trimesh.Trimesh | None, list[str]]:
     """Remove faces that cannot be drawn and vertices without faces, and make normals agree with faces.
 
@@ -185,13 +186,8 @@ def _degenerate(vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> npt.NDAr
 
 
 def _first_of_their_corners(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """The faces, in order, without those that have the three vertices of an earlier one."""
-    low, high = faces.min(axis=1, initial=0), faces.max(axis=1, initial=0)
-    middle = faces.sum(axis=1) - low - high
-    base = int(high.max(initial=0)) + 1
-    if base < 2**21:  # three of them fit into one integer
-        return np.sort(np.unique((low * base + middle) * base + high, return_index=True)[1])
-    return np.sort(np.unique(np.stack((low, middle, high), axis=1), axis=0, return_index=True)[1])
+    """Indices of the faces, in order, without those that have the three vertices of an earlier one."""
+    return np.sort(unique_rows(np.sort(faces, axis=1))[0])
 
 
 def _normals(

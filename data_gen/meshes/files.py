@@ -1,10 +1,11 @@
-"""Limits on the files of a mesh (formats, bytes, pixels), and the error for meshes that are refused.
+"""The files of a mesh: their limits (formats, bytes, pixels), their bytes and text, and the error for refused meshes.
 
 Sizes are checked before a file is read, pixels before they are decoded.
 """
 
 from __future__ import annotations
 
+import codecs
 import io
 import warnings
 from pathlib import Path
@@ -22,8 +23,10 @@ __all__ = [
     "MESH_SUFFIXES",
     "OTHER_SUFFIXES",
     "STATES_ITS_AXIS",
+    "UNFINISHED",
     "MeshError",
     "check_image",
+    "decode_text",
     "read_bytes",
 ]
 
@@ -54,6 +57,9 @@ MAX_PARTS = 20_000
 IMAGE_FORMATS = ("PNG", "JPEG", "BMP", "GIF", "TIFF", "TGA", "WEBP", "PPM", "DDS", "JPEG2000")
 """Texture formats that are decoded, by Pillow's names; none of them starts a program."""
 
+UNFINISHED = "the last line does not end: the file may have been cut"
+"""The warning about a text file without an end of its last line."""
+
 
 class MeshError(ValueError):
     """A mesh that is refused. The message is one line: file, expected, found, remedy."""
@@ -79,6 +85,16 @@ def read_bytes(path: Path, *, limit: int) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise MeshError(f"{path}: expected a readable file, found {error.strerror or error}") from error
+
+
+def decode_text(data: bytes) -> str:
+    """Text of a file without declared encoding: UTF-16 with a byte order mark, UTF-8, else Latin-1."""
+    if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return data.decode("utf-16", errors="replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 def check_image(data: bytes, name: str, *, limit: int) -> int:

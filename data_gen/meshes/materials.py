@@ -144,7 +144,7 @@ def select_vertices(visual: TextureVisuals, used: npt.NDArray[np.int64]) -> Text
 
 
 def canonical_visual(
-    mesh: trimesh.Trimesh, label: str, *, colours: ColourSpace = "scene", images: dict[Any, Any] | None = None
+    mesh: trimesh.Trimesh, label: str, *, colours: ColourSpace, images: dict[Any, Any]
 ) -> tuple[Any, list[str], bool]:
     """Convert the colours of a mesh to a form that all renderers draw alike.
 
@@ -158,7 +158,6 @@ def canonical_visual(
         The visual, warnings about what was lost, and whether the surface is visible at all.
     """
     visual = visual_of(mesh)
-    images = {} if images is None else images
     if isinstance(visual, TextureVisuals):
         return _textured(visual, mesh, label, colours, images)
     if not visual.defined:

@@ -16,12 +16,12 @@ import numpy.typing as npt
 import trimesh
 
 from data_gen.meshes.clean import check_faces, clean, decimate, is_smooth, smooth_normals
-from data_gen.meshes.dae import declared_up
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PARTS, MAX_TEXT_BYTES, MESH_SUFFIXES, MeshError, read_bytes
 from data_gen.meshes.find import safe_name
+from data_gen.meshes.formats.dae import declared_up
+from data_gen.meshes.formats.read import read_scene
 from data_gen.meshes.materials import ColourSpace, canonical_visual
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.read import read_scene
 from hyperplanes.utilities.encoding import sha256
 
 __all__ = [
@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 MAX_FACES = 2_000_000
-"""Default limit of triangles: larger meshes are decimated if that does no damage, 8 times larger ones refused."""
+"""Most triangles: larger meshes are decimated to as many if that does no damage, 8 times larger ones refused."""
 
 _DECIMATED_FROM = 8
 _OUTLIER = 30.0
@@ -70,7 +70,6 @@ def load_mesh(
     *,
     up: Literal["y", "z"] | None = None,
     name: str | None = None,
-    max_faces: int = MAX_FACES,
     within: Path | None = None,
 ) -> Mesh:
     """Read a mesh file.
@@ -79,7 +78,6 @@ def load_mesh(
         path: a GLB, glTF, OBJ, PLY, STL, OFF or DAE file.
         up: the axis that points up in the file; by default y, or what a COLLADA file declares.
         name: its name; the file's name by default.
-        max_faces: more triangles are decimated to as many, or drawn as they are with a warning; 8 times more, refused.
         within: the folder that must contain all files of the mesh; by default the model's own.
 
     Returns:
@@ -106,7 +104,6 @@ def load_mesh(
         scene,
         name or safe_name(path.stem),
         up=up or ("z" if axis == "z" else "y"),
-        max_faces=max_faces,
         colours=colours,
         warnings=(*lost, *lines, *folder.notes),
         source=str(path),
@@ -120,7 +117,6 @@ def prepare_scene(
     name: str,
     *,
     up: Literal["y", "z"] = "y",
-    max_faces: int = MAX_FACES,
     colours: ColourSpace = "scene",
     warnings: tuple[str, ...] = (),
     source: str | None = None,
@@ -132,7 +128,6 @@ def prepare_scene(
         scene: geometries and node transforms.
         name: name of the mesh.
         up: the axis that points up in the scene.
-        max_faces: more triangles are decimated to as many, or drawn as they are with a warning; 8 times more, refused.
         colours: `scene`: vertex and face colours are sRGB, factors of materials linear; `gltf`: vertex colours on top
             of a material are linear, too; `srgb`: all are sRGB. Textures are always sRGB.
         warnings: earlier warnings.
@@ -150,14 +145,14 @@ def prepare_scene(
         raise ValueError(f"up: expected 'y' or 'z', received {up!r}")
     source = source or name
     found = list(warnings)
-    _refuse_too_many(scene, max_faces, source)
+    _refuse_too_many(scene, source)
     with np.errstate(all="ignore"):
         parts, scale = _clean_parts(scene, colours, found, source)
     if not parts:
         raise MeshError(f"{source}: expected triangles to draw, found none; {'; '.join(found) or 'export it again'}")
     faces = sum(len(part.faces) for part in parts)
-    if faces > max_faces:
-        smaller = decimate(parts, max_faces)
+    if faces > MAX_FACES:
+        smaller = decimate(parts, MAX_FACES)
         if smaller is None:
             found.append(f"{faces} triangles drawn as they are: textures or face colours would not survive decimation")
         else:
@@ -188,16 +183,16 @@ def mesh_parts(mesh: Mesh) -> list[trimesh.Trimesh]:
     return [mesh.scene.geometry[name] for name in sorted(mesh.scene.geometry)]
 
 
-def _refuse_too_many(scene: trimesh.Scene, max_faces: int, source: str) -> None:
+def _refuse_too_many(scene: trimesh.Scene, source: str) -> None:
     """Count the parts and the triangles of all instances before any is copied."""
     faces, parts = 0, len(scene.graph.nodes_geometry)
     if parts > MAX_PARTS:
         raise MeshError(f"{source}: expected at most {MAX_PARTS} parts, found {parts}; merge them")
     for node in scene.graph.nodes_geometry:
         faces += len(getattr(scene.geometry[scene.graph[node][1]], "faces", ()))
-    if faces > _DECIMATED_FROM * max_faces:
+    if faces > _DECIMATED_FROM * MAX_FACES:
         raise MeshError(
-            f"{source}: expected at most {_DECIMATED_FROM * max_faces} triangles before decimation, found {faces}; "
+            f"{source}: expected at most {_DECIMATED_FROM * MAX_FACES} triangles before decimation, found {faces}; "
             "simplify the mesh"
         )
 

@@ -54,7 +54,7 @@ def model_root(path: Path) -> Path:
     return folder.parent if of_shapenet or of_gazebo else folder
 
 
-def model_checksums(path: Path, names: Iterable[str], within: Path | None = None) -> dict[str, str | None]:
+def model_checksums(path: Path, names: Iterable[str], within: Path) -> dict[str, str | None]:
     """Checksums of the files of a model, without parsing them.
 
     Args:
@@ -83,7 +83,7 @@ class ModelFolder(Resolver):
 
     Args:
         path: the mesh file; messages begin with its name.
-        within: the folder that must contain all files; `model_root(path)` by default, and if the file is not in it.
+        within: the folder that must contain all files; `model_root(path)` when None, and if the file is not in it.
 
     A missing file, or a texture that cannot be decoded, is a FileNotFoundError and noted in `lost`.
 
@@ -93,7 +93,7 @@ class ModelFolder(Resolver):
         refused: the first reason to refuse the whole model, if any, since loaders swallow exceptions.
     """
 
-    def __init__(self, path: Path, within: Path | None = None) -> None:
+    def __init__(self, path: Path, within: Path | None) -> None:
         self.path = path
         self.folder = path.parent.resolve()
         self.root = model_root(path) if within is None else within.resolve()
@@ -103,7 +103,6 @@ class ModelFolder(Resolver):
         self.lost: dict[str, str] = {}
         self.notes: list[str] = []
         self.refused: MeshError | None = None
-        self.file_name = path.name
         self._bytes: dict[Path, bytes] = {}
         self._places: dict[str, Path | None] = {}
         self._images: set[Path] = set()

@@ -162,7 +162,10 @@ class _Scene:
 
     def normals(self, hits: Hits, view_directions: Floats) -> Floats:
         """The shading normals (hit, 3)."""
-        return facing(self._interpolated(hits, "normals", 3), self.ray_caster.facets[hits.faces], view_directions)
+        normals = np.empty((len(hits.rays), 3))
+        for surface, number, selected in self._by_surface(hits):
+            normals[selected] = _interpolate(surface.normals[surface.faces[number]], hits.corners[selected])
+        return facing(normals, self.ray_caster.facets[hits.faces], view_directions)
 
     def base(self, hits: Hits, spread: tuple[Floats, Floats] | None) -> Floats:
         """Linear base colours (hit, 4), alpha after the cutoff; textures at full size if no spread is given."""
@@ -170,10 +173,11 @@ class _Scene:
         for surface, number, selected in self._by_surface(hits):
             colour = np.broadcast_to(surface.base_colour, (len(selected), 4)).copy()
             if surface.colours is not None:
-                colour *= _interpolate(surface.colours, surface.faces[number], hits.corners[selected])
+                colour *= _interpolate(surface.colours[surface.faces[number]], hits.corners[selected])
             if surface.texture is not None:
                 texture = self._texture(surface.texture, surface.wrap)
-                texel = self._texel(surface.uv, surface, texture, hits, selected, number, spread)
+                assert surface.uv is not None
+                texel = self._texel(texture, surface.uv[surface.faces[number]], hits, selected, spread)
                 colour[:, :3] *= linear_from_srgb(np.minimum(texel[:, :3] / np.maximum(texel[:, 3:], 1e-4), 1.0))
                 colour[:, 3] *= texel[:, 3]
             if surface.cutoff is not None:
@@ -192,7 +196,8 @@ class _Scene:
                 if surface.emissive_texture is not None:
                     texture = self._texture(surface.emissive_texture, surface.emissive_wrap)
                     uv = surface.uv if surface.emissive_uv is None else surface.emissive_uv
-                    texel = self._texel(uv, surface, texture, hits, selected, number, spread)
+                    assert uv is not None
+                    texel = self._texel(texture, uv[surface.faces[number]], hits, selected, spread)
                     light[selected] *= linear_from_srgb(texel[:, :3])
         return light
 
@@ -203,41 +208,29 @@ class _Scene:
             selected = np.flatnonzero(owner == index)
             yield self.surfaces[index], hits.faces[selected] - self.ray_caster.first_face[index], selected
 
-    def _interpolated(self, hits: Hits, field: str, width: int) -> Floats:
-        values = np.empty((len(hits.rays), width))
-        for surface, number, selected in self._by_surface(hits):
-            values[selected] = _interpolate(getattr(surface, field), surface.faces[number], hits.corners[selected])
-        return values
-
     def _texel(
         self,
-        coordinates: Floats | None,
-        surface: ShadedSurface,
         texture: MipmappedTexture,
+        corners: Floats,
         hits: Hits,
         selected: npt.NDArray[np.int64],
-        number: npt.NDArray[np.int64],
         spread: tuple[Floats, Floats] | None,
     ) -> Floats:
-        assert coordinates is not None
-        corners = coordinates[surface.faces[number]]
-        uv = np.einsum("hc,hcx->hx", hits.corners[selected], corners)
+        """RGBA (hit, 4) of the selected hits, whose faces have texture coordinates (hit, 3, 2) at their corners."""
         level = np.zeros(len(selected))
         if spread is not None:
             rays, steps = spread
-            facets, gradients = (
-                self.ray_caster.facets[hits.faces[selected]],
-                self.ray_caster.gradients[hits.faces[selected]],
-            )
-            edges = corners[:, 1:] - corners[:, :1]
-            gradients = np.einsum("hcx,hci->hxi", edges, gradients) * np.array([[texture.width], [texture.height]])
+            faces = hits.faces[selected]
+            facets, edges = self.ray_caster.facets[faces], corners[:, 1:] - corners[:, :1]
+            gradients = np.einsum("hcx,hci->hxi", edges, self.ray_caster.gradients[faces])
+            gradients *= np.array([[texture.width], [texture.height]])
             lengths = []
             for step in steps:
                 slide = (facets @ step) / np.einsum("hi,hi->h", facets, rays[selected])
                 moved = hits.distances[selected, None] * (step - slide[:, None] * rays[selected])
                 lengths.append(np.linalg.norm(np.einsum("hxi,hi->hx", gradients, moved), axis=1))
             level = np.log2(np.maximum(np.maximum(*lengths), 1e-12))
-        return texture.sample(uv, level).astype(np.float64)
+        return texture.sample(_interpolate(corners, hits.corners[selected]), level).astype(np.float64)
 
     def _texture(self, texels: npt.NDArray[np.uint8], wrap: tuple[Wrap, Wrap]) -> MipmappedTexture:
         key = (id(texels), wrap)
@@ -253,6 +246,6 @@ def _unpremultiplied(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
     return np.clip(np.rint(np.concatenate((colour, alpha), axis=-1)), 0, 255).astype(np.uint8)
 
 
-def _interpolate(values: Floats, faces: npt.NDArray[np.int64], corners: Floats) -> Floats:
-    """Vertex values interpolated by barycentric weights: (vertex, value), (hit, 3), (hit, 3) -> (hit, value)."""
-    return np.einsum("hc,hcx->hx", corners, values[faces])
+def _interpolate(values: Floats, weights: Floats) -> Floats:
+    """Values (hit, 3, value) at the corners of faces, interpolated by barycentric weights (hit, 3): (hit, value)."""
+    return np.einsum("hc,hcx->hx", weights, values)

@@ -34,10 +34,9 @@ Floats = npt.NDArray[np.float64]
 _TextureKey = tuple[int, tuple[Wrap, Wrap]]
 _WRAPS = {"repeat": GL.GL_REPEAT, "clamp": GL.GL_CLAMP_TO_EDGE, "mirror": GL.GL_MIRRORED_REPEAT}
 
-_OUTER, _INNER = 1.0, -1.0
-# Drawn with flipped rows, so that glReadPixels, which starts at the bottom, returns the first row on top; the flip
-# reverses the winding of every triangle.
-_HIDDEN = {_OUTER: GL.GL_FRONT, _INNER: GL.GL_BACK}
+# Sides of faces, by what OpenGL culls to draw them. Drawn with flipped rows, so that glReadPixels, which starts at the
+# bottom, returns the first row on top; the flip reverses the winding of every triangle.
+_OUTER, _INNER = GL.GL_FRONT, GL.GL_BACK
 # COINCIDENT in steps of 24-bit depth; one step is 0.44 of it at distance 3. No offset for the slope of a face, which
 # would push inner sides behind outer ones at silhouettes.
 _OFFSET = 0.44 * COINCIDENT * 2**24
@@ -84,7 +83,6 @@ class Drawable:
             "EMISSIVE_TEXTURE": self.emissive_texture is not None,
             "TRANSLUCENT": not surface.opaque or surface.cutoff is not None,
             "UNLIT": surface.unlit,
-            "ALIGNED": _aligned(surface),
         }
         self.constants = constants_of_surface(surface)
         self.defines |= {name: 1 for name, needed in needs.items() if needed}
@@ -92,7 +90,15 @@ class Drawable:
 
 
 class SurfaceRenderer(Renderer):
-    """A pyrender Renderer that draws surfaces into RGBA with straight alpha."""
+    """A pyrender Renderer that draws surfaces into RGBA with straight alpha.
+
+    Its resources are freed with the OpenGL context, when the process ends.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        super().__init__(width, height)
+        self._programs: dict[tuple[Any, ...], ShaderProgram] = {}
+        self._buffers: SampleFramebuffers | None = None
 
     def load(self, surfaces: Sequence[ShadedSurface]) -> list[Drawable]:
         """Upload surfaces to the context, replacing the previous ones.
@@ -109,7 +115,7 @@ class SurfaceRenderer(Renderer):
         if drawables:
             scene.add_node(Node(mesh=Mesh([drawable.primitive for drawable in drawables])))
         self._update_context(scene, RenderFlags.NONE)
-        return sorted(drawables, key=lambda drawable: (not drawable.surface.opaque, _program_key(drawable)))
+        return sorted(drawables, key=lambda each: (not each.surface.opaque, _program_key(each.defines, each.constants)))
 
     def draw(
         self,
@@ -133,7 +139,11 @@ class SurfaceRenderer(Renderer):
         Returns:
             sRGB with straight alpha `(height, width, 4)`, first row on top.
         """
-        buffers = self._buffers(size)
+        if self._buffers is None or self._buffers.size != size:
+            if self._buffers is not None:
+                self._buffers.delete()
+            self._buffers = SampleFramebuffers(*size)
+        buffers = self._buffers
         GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, buffers.drawn)
         GL.glViewport(0, 0, size[0] * size[2], size[1] * size[2])
         GL.glEnable(GL.GL_DEPTH_TEST)
@@ -176,32 +186,13 @@ class SurfaceRenderer(Renderer):
         GL.glUseProgram(0)
         return picture
 
-    def delete(self) -> None:
-        """Free all OpenGL resources of this renderer."""
-        for program in self.__dict__.pop("_surface_programs", {}).values():
-            program.delete()
-        buffers: SampleFramebuffers | None = self.__dict__.pop("_sample_buffers", None)
-        if buffers is not None:
-            buffers.delete()
-        super().delete()
-
-    def _buffers(self, size: tuple[int, int, int]) -> SampleFramebuffers:
-        """The buffers of the last view if their size fits, else new ones."""
-        buffers: SampleFramebuffers | None = self.__dict__.get("_sample_buffers")
-        if buffers is None or buffers.size != size:
-            if buffers is not None:
-                buffers.delete()
-            buffers = self.__dict__["_sample_buffers"] = SampleFramebuffers(*size)
-        return buffers
-
     def _bind(self, drawable: Drawable, bound: ShaderProgram | None, view: Any) -> ShaderProgram:
-        programs: dict[tuple[Any, ...], ShaderProgram] = self.__dict__.setdefault("_surface_programs", {})
         defines = drawable.defines | {"LIGHTS": len(view[-1])}
         constants = drawable.constants | constants_of_lighting(view[2])
-        key = (*sorted(defines.items()), *sorted(constants.items()))
-        if key not in programs:
-            programs[key] = ShaderProgram(defines, constants)
-        program = programs[key]
+        key = _program_key(defines, constants)
+        if key not in self._programs:
+            self._programs[key] = ShaderProgram(defines, constants)
+        program = self._programs[key]
         if program is not bound:
             GL.glUseProgram(program.handle)
             program.set_view(*view)
@@ -213,7 +204,7 @@ class SurfaceRenderer(Renderer):
         bound: ShaderProgram | None,
         view: Any,
         layer: int,
-        side: float,
+        side: int,
         *,
         culled: bool = False,
     ) -> ShaderProgram | None:
@@ -223,8 +214,8 @@ class SurfaceRenderer(Renderer):
         if count == 0:
             return bound
         program = self._bind(drawable, bound, view)
-        GL.glCullFace(_HIDDEN[side])
-        program.set_surface(drawable.surface, layer, side)
+        GL.glCullFace(side)
+        program.set_surface(drawable.surface, layer)
         for unit, texture in enumerate((drawable.base_texture, drawable.emissive_texture)):
             if texture is not None:
                 GL.glActiveTexture(int(GL.GL_TEXTURE0) + unit)
@@ -247,16 +238,8 @@ def _upload(faces: npt.NDArray[np.int64]) -> None:
     GL.glBufferSubData(GL.GL_ELEMENT_ARRAY_BUFFER, 0, indices.nbytes, indices)
 
 
-def _program_key(drawable: Drawable) -> tuple[Any, ...]:
-    return (*sorted(drawable.defines.items()), *sorted(drawable.constants.items()))
-
-
-def _aligned(surface: ShadedSurface) -> bool:
-    """Whether all normals are on the outer side of their face, so that the shader need not check."""
-    corners = surface.positions[surface.faces]
-    facets = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    agreement = np.einsum("fi,fci->fc", facets, surface.normals[surface.faces])
-    return bool((agreement[facets.any(axis=1)] > 0.0).all())
+def _program_key(defines: dict[str, int], constants: dict[str, str]) -> tuple[Any, ...]:
+    return (*sorted(defines.items()), *sorted(constants.items()))
 
 
 def _texture(

@@ -65,15 +65,11 @@ class RayCaster:
         gradients = np.stack((np.cross(edges[1], self.facets), np.cross(self.facets, edges[0])), axis=1)
         self.gradients = np.divide(gradients, area[..., None], out=np.zeros_like(gradients), where=area[..., None] > 0)
         self._triangles = np.ascontiguousarray(triangles, dtype=np.float32)
-        self._culled = np.concatenate(
-            [np.full(count, surface.culled) for surface, count in zip(surfaces, counts, strict=True)]
-        )
-        self._fills = np.concatenate(
-            [np.full(count, surface.opaque) for surface, count in zip(surfaces, counts, strict=True)]
-        )
-        self._all = _EmbreeFaces(self._triangles)
-        self._met: tuple[bytes, _EmbreeFaces, Indices] | None = None
-        self._outer: tuple[bytes, _EmbreeFaces, Indices] | None = None
+        self._culled = np.repeat([surface.culled for surface in surfaces], counts)
+        self._fills = np.repeat([surface.opaque for surface in surfaces], counts)
+        self._all = _EmbreeFaces(self._triangles, np.arange(len(triangles)))
+        self._origin = b""
+        self._seen: dict[bool, _EmbreeFaces] = {}
 
     def cast(self, origin: Floats, directions: Floats, after: Floats | None = None) -> Hits:
         """Find the first face on each ray.
@@ -103,21 +99,21 @@ class RayCaster:
         """The first face (ray,) on each ray, the culled ones after all others; -1 where there is none."""
         if not self._culled.any():
             return self._all.first(starts, directions)
-        if self._met is None or self._met[0] != origin.tobytes():  # all rays of a view have one origin
-            numbers = np.flatnonzero(~self._culled | (self._towards(origin) > 0.0))
-            self._met = origin.tobytes(), _EmbreeFaces(self._triangles[numbers]), numbers
-        _, scene, numbers = self._met
-        found = scene.first(starts, directions)
-        faces = np.full(len(found), -1, dtype=np.int64)
-        faces[found >= 0] = numbers[found[found >= 0]]
-        missed = np.flatnonzero(found < 0)
+        faces = self._seen_from(origin, only_outer=False).first(starts, directions)
+        missed = np.flatnonzero(faces < 0)
         behind = self._all.first(starts[missed], directions[missed])
         faces[missed] = np.where(self._fills[behind], behind, -1)
         return faces
 
-    def _towards(self, origin: Floats) -> Floats:
-        """Numbers (face,) that are positive for faces whose outer side faces a point."""
-        return np.einsum("fi,fi->f", self.facets, origin - self._start)
+    def _seen_from(self, origin: Floats, *, only_outer: bool) -> _EmbreeFaces:
+        """The faces whose outer side faces a point, and unless only those, also others that are not culled."""
+        if self._origin != origin.tobytes():  # all rays of a view have one origin
+            self._origin, self._seen = origin.tobytes(), {}
+        if only_outer not in self._seen:
+            seen = np.einsum("fi,fi->f", self.facets, origin - self._start) > 0.0
+            numbers = np.flatnonzero(seen if only_outer else seen | ~self._culled)
+            self._seen[only_outer] = _EmbreeFaces(self._triangles[numbers], numbers)
+        return self._seen[only_outer]
 
     def _outer_where_coincident(
         self, origin: Floats, starts: Floats, directions: Floats, faces: Indices
@@ -127,12 +123,8 @@ class RayCaster:
         inner = np.flatnonzero(np.einsum("ri,ri->r", self.facets[faces], directions) > 0.0)
         if len(inner) == 0:
             return faces, distances
-        if self._outer is None or self._outer[0] != origin.tobytes():  # all rays of a view have one origin
-            numbers = np.flatnonzero(self._towards(origin) > 0.0)
-            self._outer = origin.tobytes(), _EmbreeFaces(self._triangles[numbers]), numbers
-        _, scene, numbers = self._outer
-        found = scene.first(starts[inner], directions[inner])
-        inner, found = inner[found >= 0], numbers[found[found >= 0]]
+        found = self._seen_from(origin, only_outer=True).first(starts[inner], directions[inner])
+        inner, found = inner[found >= 0], found[found >= 0]
         beyond = self._distances(origin, directions[inner], found)
         near = beyond <= distances[inner] + COINCIDENT
         faces[inner[near]], distances[inner[near]] = found[near], beyond[near]
@@ -147,23 +139,24 @@ class RayCaster:
 
 
 class _EmbreeFaces:
-    """Triangles (face, 3, 3) in an Embree scene."""
+    """Triangles (face, 3, 3) in an Embree scene, and their numbers (face,)."""
 
-    def __init__(self, triangles: npt.NDArray[np.float32]) -> None:
+    def __init__(self, triangles: npt.NDArray[np.float32], numbers: Indices) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
+        self._numbers = np.append(numbers, -1)
         self._scene = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self._scene, triangles) if len(triangles) else None
 
     def first(self, starts: Floats, directions: Floats) -> Indices:
-        """The first face (ray,) on each ray, -1 where there is none."""
+        """The number of the first face (ray,) on each ray, -1 where there is none."""
         if self._mesh is None:
             return np.full(len(directions), -1, dtype=np.int64)
         found = self._scene.run(
             np.ascontiguousarray(starts, dtype=np.float32), np.ascontiguousarray(directions, dtype=np.float32)
         )
-        return found.astype(np.int64)
+        return self._numbers[found]
 
 
 def pixel_rays(pose: Floats, intrinsics: Floats, columns: Floats, rows: Floats) -> Floats:

@@ -132,14 +132,10 @@ void main() {
 #else
     vec3 towards = camera - point;
     towards *= inversesqrt(dot(towards, towards));
-#ifdef ALIGNED
-    vec3 n = side * point_normal;
-#else
     vec3 facet = cross(dFdx(point), dFdy(point));
     facet = dot(facet, towards) < 0.0 ? -facet : facet;
     vec3 n = dot(point_normal, point_normal) > 1e-8 ? point_normal : facet;
     n = dot(n, facet) < 0.0 ? -n : n;
-#endif
     n *= inversesqrt(dot(n, n));
     float facing = dot(n, towards);
     float masking = max(facing, 0.05) * (1.0 - shadowing) + shadowing;
@@ -183,7 +179,6 @@ _TYPES = {
     "metallic": "float",
     "squared_alpha": "float",
     "shadowing": "float",
-    "side": "float",
 }
 _COMMON_ROUGHNESS = (0.55, DEFAULT_ROUGHNESS)  # of generated objects, and of files that state none
 
@@ -199,8 +194,6 @@ def constants_of_surface(surface: ShadedSurface) -> dict[str, str]:
         constants["metallic"] = "0.0"
     if surface.roughness in _COMMON_ROUGHNESS:
         constants |= {name: f"{value:.9g}" for name, value in _roughness_constants(surface.roughness).items()}
-    if surface.two_sided == 0 and not surface.culled:
-        constants["side"] = "1.0"
     return constants
 
 
@@ -243,7 +236,7 @@ class ShaderProgram:
 
     Args:
         defines: features of the surfaces: UV, EMISSIVE_UV and COLOUR with the number of their vertex attribute,
-            TEXTURE, EMISSIVE_TEXTURE, TRANSLUCENT, UNLIT and ALIGNED, and LIGHTS, the number of lights.
+            TEXTURE, EMISSIVE_TEXTURE, TRANSLUCENT and UNLIT, and LIGHTS, the number of lights.
         constants: GLSL values that replace uniforms.
 
     Attributes:
@@ -279,23 +272,12 @@ class ShaderProgram:
         GL.glUniform3f(self._at("sky"), *lighting.sky)
         GL.glUniform3f(self._at("ground"), *lighting.ground)
 
-    def set_surface(self, surface: ShadedSurface, layer: int, side: float) -> None:
-        """Set the uniforms of a surface.
-
-        Args:
-            surface: the surface.
-            layer: OPAQUE_TEXELS or TRANSLUCENT_TEXELS.
-            side: 1 for the faces' outer sides, -1 for the inner ones.
-        """
+    def set_surface(self, surface: ShadedSurface, layer: int) -> None:
+        """Set the uniforms of a surface, of which OPAQUE_TEXELS or TRANSLUCENT_TEXELS are drawn."""
         GL.glUniform4f(self._at("base_colour"), *surface.base_colour)
         GL.glUniform3f(self._at("emissive"), *surface.emissive)
         for name, value in _roughness_constants(surface.roughness).items():
             GL.glUniform1f(self._at(name), value)
         GL.glUniform1f(self._at("metallic"), surface.metallic)
-        GL.glUniform1f(self._at("side"), side)
         GL.glUniform1f(self._at("cutoff"), -1.0 if surface.cutoff is None else surface.cutoff)
         GL.glUniform1i(self._at("layer"), layer)
-
-    def delete(self) -> None:
-        """Free the program."""
-        GL.glDeleteProgram(self.handle)

@@ -116,7 +116,7 @@ class ShadedSurface:
     opaque: bool
     unlit: bool
     two_sided: int
-    culled: bool = False
+    culled: bool
 
 
 def shaded_surfaces(parts: Sequence[trimesh.Trimesh], name: str = "object") -> list[ShadedSurface]:

@@ -24,7 +24,7 @@ class MipmappedTexture:
         wrap: wrap mode along u and along v.
     """
 
-    def __init__(self, texels: npt.NDArray[np.uint8], wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")) -> None:
+    def __init__(self, texels: npt.NDArray[np.uint8], wrap: tuple[Wrap, Wrap]) -> None:
         self._wrap = wrap
         levels = [texels]
         while max(levels[-1].shape[:2]) > 1:

@@ -15,8 +15,8 @@ _SPIRAL_ANGLE = 20.0  # radians about the vertical axis from the horizon to the 
 
 
 def fixed(
-    views: int = 50,
-    resolution: int = 128,
+    views: int,
+    resolution: int,
     *,
     distance: float = DEFAULT_DISTANCE,
     field_of_view: float | None = None,
@@ -30,7 +30,6 @@ def fixed(
 
     The arguments are those of `make_rig`.
     """
-    _check_views(views)
     bottom, top = (math.sin(math.radians(elevation)) for elevation in (-20.0, 80.0))
     directions = np.empty((views, 3))
     for first in (0, 1):
@@ -44,8 +43,8 @@ def fixed(
 
 
 def random(
-    views: int = 50,
-    resolution: int = 128,
+    views: int,
+    resolution: int,
     *,
     seed: int,
     distance: float = DEFAULT_DISTANCE,
@@ -55,13 +54,7 @@ def random(
     """Cameras at random, uniformly in area over the sphere above an elevation.
 
     Elevations are at least `lowest` degrees (0 for the upper hemisphere); the other arguments are those of `make_rig`.
-
-    Raises:
-        ValueError: if `lowest`, or an argument of `make_rig`, is invalid.
     """
-    _check_views(views)
-    if not -90.0 <= lowest < 90.0:
-        raise ValueError(f"lowest: expected -90 <= lowest < 90 degrees, received {lowest}")
     generator = np.random.default_rng(seed)
     heights = generator.uniform(math.sin(math.radians(lowest)), 1.0, views)
     azimuths = generator.uniform(0.0, 2.0 * math.pi, views)
@@ -69,8 +62,8 @@ def random(
 
 
 def orbit(
-    views: int = 60,
-    resolution: int = 128,
+    views: int,
+    resolution: int,
     *,
     elevation: float = 20.0,
     distance: float = DEFAULT_DISTANCE,
@@ -80,21 +73,15 @@ def orbit(
 
     The first is in the direction of +z, all are `elevation` degrees above the horizon; the other arguments are those of
     `make_rig`.
-
-    Raises:
-        ValueError: if the number of views, elevation, distance or resolution is invalid.
     """
-    _check_views(views)
-    if not -90.0 <= elevation <= 90.0:
-        raise ValueError(f"elevation: expected -90 to 90 degrees, received {elevation}")
     azimuths = 2.0 * math.pi * np.arange(views) / views
     heights = np.full(views, math.sin(math.radians(elevation)))
     return aimed(_directions(heights, azimuths), resolution, distance, field_of_view)
 
 
 def spiral(
-    views: int = 251,
-    resolution: int = 128,
+    views: int,
+    resolution: int,
     *,
     distance: float = DEFAULT_DISTANCE,
     field_of_view: float | None = None,
@@ -104,16 +91,10 @@ def spiral(
     Elevations grow in equal steps to 90 degrees, while the azimuth turns by 20 radians, as in the renderings of
     SRN's test objects (Sitzmann et al. 2019); the arguments are those of `make_rig`.
     """
-    _check_views(views)
     steps = np.arange(views) / max(views - 1, 1)
     return aimed(
         _directions(np.sin(0.5 * math.pi * steps), -_SPIRAL_ANGLE * steps), resolution, distance, field_of_view
     )
-
-
-def _check_views(views: int) -> None:
-    if views < 1:
-        raise ValueError(f"views: expected at least 1, received {views}")
 
 
 def _directions(heights: Array, azimuths: Array) -> Array:

@@ -108,7 +108,7 @@ class Rig:
         return pinhole(as_tensor(self.intrinsics[views].copy(), dtype=dtype), extrinsics, self.height, self.width)
 
 
-def fitting_field_of_view(distance: float = DEFAULT_DISTANCE) -> float:
+def fitting_field_of_view(distance: float) -> float:
     """Field of view at which the unit sphere just fits, with a margin of 4 %.
 
     Args:

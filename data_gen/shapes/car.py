@@ -9,8 +9,9 @@ import numpy as np
 
 from data_gen.shapes.car_body import body
 from data_gen.shapes.car_frame import CarFrame, sample_frame
+from data_gen.shapes.choices import pick
 from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
-from data_gen.shapes.parts import Part, pair, pick
+from data_gen.shapes.parts import Part, pair
 from data_gen.shapes.patterns import wheel_face
 from data_gen.shapes.primitives import ball, box, cylinder, tapered
 from data_gen.shapes.profiles import ellipse
@@ -21,22 +22,22 @@ __all__ = ["car"]
 _SHARES = {
     "sedan": 3, "coupe": 1.5, "hatchback": 2.5, "wagon": 1.5, "suv": 2.5, "van": 1.5, "pickup": 1.5, "sports": 2
 }  # fmt: skip
-_PAINTS: tuple[tuple[float, float, float, float], ...] = (  # hue, saturation, value, weight
-    (0.0, 0.85, 0.75, 3.0),
-    (0.6, 0.75, 0.65, 3.0),
-    (0.13, 0.85, 0.92, 1.6),
-    (0.07, 0.85, 0.88, 1.4),
-    (0.36, 0.6, 0.45, 1.4),
-    (0.5, 0.6, 0.6, 1.2),
-    (0.0, 0.03, 0.66, 1.6),
-    (0.62, 0.12, 0.35, 1.4),
-    (0.0, 0.05, 0.16, 1.2),
-    (0.95, 0.7, 0.45, 0.9),
-    (0.58, 0.4, 0.85, 1.0),
-    (0.09, 0.35, 0.72, 0.8),
-    (0.78, 0.45, 0.5, 0.6),
-    (0.24, 0.65, 0.7, 0.8),
-)
+_PAINTS: dict[tuple[float, float, float], float] = {  # hue, saturation, value: weight
+    (0.0, 0.85, 0.75): 3.0,
+    (0.6, 0.75, 0.65): 3.0,
+    (0.13, 0.85, 0.92): 1.6,
+    (0.07, 0.85, 0.88): 1.4,
+    (0.36, 0.6, 0.45): 1.4,
+    (0.5, 0.6, 0.6): 1.2,
+    (0.0, 0.03, 0.66): 1.6,
+    (0.62, 0.12, 0.35): 1.4,
+    (0.0, 0.05, 0.16): 1.2,
+    (0.95, 0.7, 0.45): 0.9,
+    (0.58, 0.4, 0.85): 1.0,
+    (0.09, 0.35, 0.72): 0.8,
+    (0.78, 0.45, 0.5): 0.6,
+    (0.24, 0.65, 0.7): 0.8,
+}
 
 
 def _wheels(rng: np.random.Generator, frame: CarFrame) -> list[Part]:
@@ -165,9 +166,7 @@ def _extras(rng: np.random.Generator, frame: CarFrame, paint: Colour) -> list[Pa
 def car(rng: np.random.Generator) -> list[Part]:
     """A car: its parts in metres, y up, front along +z, standing on y = 0."""
     frame = sample_frame(rng, pick(rng, _SHARES))
-    weights = np.array([paint[3] for paint in _PAINTS])
-    hue, saturation, value, _ = _PAINTS[rng.choice(len(_PAINTS), p=weights / weights.sum())]
-    paint = tint(rng, hue, saturation, value, 0.08)
+    paint = tint(rng, *pick(rng, _PAINTS), 0.08)
     cover = plain(paint, "paint") if rng.random() < 0.6 else plain((38, 38, 42), "cover")
     return [
         body(rng, frame, paint),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_gen.shapes.car_frame import CarFrame
-from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
+from data_gen.shapes.materials import Colour, Material, brighten, canvas, plain, tint
 from data_gen.shapes.parts import Part
 from data_gen.shapes.solids import Solid, loft
 
@@ -84,7 +84,7 @@ def _flank(rng: np.random.Generator, frame: CarFrame, paint: Colour, pillars: li
     (_, low, back), (_, high, front) = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     row, column = np.mgrid[0:80, 0:224]
     z, y = back + (column + 0.5) / 224 * (front - back), high - (row + 0.5) / 80 * (high - low)
-    image = np.tile(np.array(paint, dtype=np.uint8), (80, 224, 1))
+    image = canvas(paint, 80, 224)
     sill, dark = frame.floor + 0.07, brighten(paint, 0.45)
     image[y < sill + 0.05] = brighten(paint, 0.7)
     contrast: Colour = (226, 222, 208) if sum(paint) < 400 else (40, 42, 50)

@@ -10,7 +10,8 @@ import numpy as np
 from data_gen.shapes.chair_backs import arms, back
 from data_gen.shapes.chair_frame import ChairFrame, Palette, sample_palette
 from data_gen.shapes.chair_legs import legs
-from data_gen.shapes.parts import Part, pick
+from data_gen.shapes.choices import pick
+from data_gen.shapes.parts import Part
 from data_gen.shapes.primitives import box, cushion
 from data_gen.shapes.solids import lathe
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from data_gen.shapes.chair_frame import ChairFrame, Palette
-from data_gen.shapes.parts import Part, pair, pick
+from data_gen.shapes.choices import pick
+from data_gen.shapes.parts import Part, pair
 from data_gen.shapes.primitives import box, cushion, panel, post, rod, tube
 
-__all__ = ["BACKS", "arms", "back"]
+__all__ = ["arms", "back"]
 
 _SINK = 0.03
 """Metres by which a back reaches into the seat."""
@@ -122,30 +121,21 @@ def _office(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> li
     return parts
 
 
-BACKS: dict[str, Callable[[np.random.Generator, ChairFrame, Palette], list[Part]]] = {
-    "ladder": _ladder,
-    "spindles": _spindles,
-    "panel": _panel,
-    "framed": _framed,
-    "padded": _padded,
-    "office": _office,
+_BACKS = {
+    "dining": {_ladder: 2, _spindles: 1.5, _panel: 2, _framed: 2, _padded: 0.7},
+    "lounge": {_padded: 3, _panel: 0.5},
+    "office": {_office: 3, _padded: 0.7},
+    "bar": {_panel: 1, _ladder: 1, _spindles: 0.5},
+    "rocking": {_ladder: 1, _spindles: 2, _framed: 1},
 }
-"""Backs by name."""
-
-_CHOICES = {
-    "dining": {"ladder": 2, "spindles": 1.5, "panel": 2, "framed": 2, "padded": 0.7},
-    "lounge": {"padded": 3, "panel": 0.5},
-    "office": {"office": 3, "padded": 0.7},
-    "bar": {"panel": 1, "ladder": 1, "spindles": 0.5},
-    "rocking": {"ladder": 1, "spindles": 2, "framed": 1},
-}
+"""How often each back is drawn, by the chair's kind."""
 
 
 def back(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Draw a back that suits the chair's kind, and build it; nothing for a stool."""
     if frame.back == 0:
         return []
-    return BACKS[pick(rng, _CHOICES[frame.kind])](rng, frame, palette)
+    return pick(rng, _BACKS[frame.kind])(rng, frame, palette)
 
 
 def arms(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.patterns import print_of, weave, wood
 
@@ -77,10 +78,10 @@ _DYES = (0.0, 0.02, 0.05, 0.09, 0.13, 0.2, 0.3, 0.38, 0.47, 0.54, 0.6, 0.64, 0.7
 
 def sample_palette(rng: np.random.Generator, kind: str) -> Palette:
     """Materials that go together for a chair of the kind."""
-    colour = tint(rng, _DYES[int(rng.integers(len(_DYES)))], rng.uniform(0.35, 0.8), rng.uniform(0.4, 0.8), 0.05)
+    colour = tint(rng, one_of(rng, _DYES), rng.uniform(0.35, 0.8), rng.uniform(0.4, 0.8), 0.05)
     level = int(rng.choice([52, 64, 128, 158]))
     metal = plain((level, level, min(255, level + 4)), "metal")
-    timber = _WOODS[int(rng.integers(len(_WOODS)))]
+    timber = one_of(rng, _WOODS)
     wooden = kind != "office" and rng.random() < 0.72
     if wooden:
         painted = rng.random() < 0.18

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from data_gen.shapes.chair_frame import ChairFrame, Palette
+from data_gen.shapes.choices import pick
 from data_gen.shapes.materials import plain
-from data_gen.shapes.parts import Part, pair, pick
+from data_gen.shapes.parts import Part, pair
 from data_gen.shapes.primitives import ball, cone, cylinder, post, rod, tapered, torus, tube
 from data_gen.shapes.solids import lathe
 
-__all__ = ["LEGS", "legs"]
+__all__ = ["legs"]
 
 _BITE = 0.012
 """Metres by which a part reaches into the one that it is joined to."""
@@ -209,30 +208,19 @@ def _rockers(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> l
     return parts
 
 
-LEGS: dict[str, Callable[[np.random.Generator, ChairFrame, Palette], list[Part]]] = {
-    "four": _four,
-    "turned": _turned,
-    "hairpin": _hairpin,
-    "sled": _sled,
-    "cantilever": _cantilever,
-    "column": _column,
-    "star": _star,
-    "rockers": _rockers,
+_LEGS = {
+    "dining": {_four: 4, _turned: 1.5, _hairpin: 1, _sled: 1, _cantilever: 1.2, _column: 0.8},
+    "lounge": {_four: 4, _hairpin: 0.6, _sled: 1, _column: 0.6},
+    "office": {_star: 1},
+    "bar": {_four: 2, _column: 1.5, _sled: 0.5},
+    "rocking": {_rockers: 1},
 }
-"""Ways to stand, by name."""
-
-_CHOICES = {
-    "dining": {"four": 4, "turned": 1.5, "hairpin": 1, "sled": 1, "cantilever": 1.2, "column": 0.8},
-    "lounge": {"four": 4, "hairpin": 0.6, "sled": 1, "column": 0.6},
-    "office": {"star": 1},
-    "bar": {"four": 2, "column": 1.5, "sled": 0.5},
-    "rocking": {"rockers": 1},
-}
+"""How often each way to stand is drawn, by the chair's kind."""
 
 
 def legs(rng: np.random.Generator, frame: ChairFrame, palette: Palette) -> list[Part]:
     """Draw a way to stand that suits the chair's kind, and build it."""
-    name = pick(rng, _CHOICES[frame.kind])
-    if frame.round_seat and name in ("sled", "cantilever"):
-        name = "four"
-    return LEGS[name](rng, frame, palette)
+    build = pick(rng, _LEGS[frame.kind])
+    if frame.round_seat and build in (_sled, _cantilever):
+        build = _four
+    return build(rng, frame, palette)

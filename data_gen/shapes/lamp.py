@@ -10,18 +10,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from data_gen.shapes.lamp_shades import Shade, sample_cloth, sample_shade, shell
+from data_gen.shapes.choices import pick
+from data_gen.shapes.lamp_shades import BULB, Shade, sample_cloth, sample_shade, shell
 from data_gen.shapes.lamp_stands import floor_stand, foot, sample_metal, table_body
 from data_gen.shapes.materials import Material, plain, tint
-from data_gen.shapes.parts import Part, pick
+from data_gen.shapes.parts import Part
 from data_gen.shapes.primitives import ball, cone, cylinder, rod, tube
 from data_gen.shapes.solids import lathe
 
-__all__ = ["KINDS", "lamp"]
+__all__ = ["lamp"]
 
 _CLOTH = ("drum", "slanted", "empire", "coolie", "bell", "barrel", "inverted", "stepped")
 _HARD = ("dome", "coolie", "bell", "tulip", "empire", "stepped")
-_BULB = plain((250, 226, 150), "bulb")
 
 
 def _moved(parts: Sequence[Part], x: float, y: float, z: float) -> list[Part]:
@@ -171,7 +171,7 @@ def _chandelier(rng: np.random.Generator) -> list[Part]:
         candle = cylinder(0.013, 0.09, 8).moved(0, tip[1] + 0.06, tip[2])
         arm.append(Part.of("candle", candle, plain((226, 206, 160), "candle")))
         flame = ball(0.019, 0.03, 0.019, 8, 6).moved(0, tip[1] + 0.125, tip[2])
-        arm.append(Part.of("flame", flame, _BULB))
+        arm.append(Part.of("flame", flame, BULB))
         if shaded:
             arm += _moved(shell(style, "small", metal, bulb=False), 0, tip[1] + 0.03, tip[2])
     else:
@@ -183,18 +183,17 @@ def _chandelier(rng: np.random.Generator) -> list[Part]:
     return [*parts, Part.of("cord", cord, metal), *_ceiling(0.19 + drop, metal)]
 
 
-KINDS: dict[str, tuple[float, Callable[[np.random.Generator], list[Part]]]] = {
-    "table": (0.36, _table),
-    "floor": (0.2, _floor),
-    "desk": (0.16, _desk),
-    "arc": (0.07, _arc),
-    "pendant": (0.12, _pendant),
-    "chandelier": (0.09, _chandelier),
+_KINDS: dict[Callable[[np.random.Generator], list[Part]], float] = {
+    _table: 0.36,
+    _floor: 0.2,
+    _desk: 0.16,
+    _arc: 0.07,
+    _pendant: 0.12,
+    _chandelier: 0.09,
 }
-"""Kinds of lamp: how often each is drawn, and its builder."""
+"""How often each kind of lamp is drawn."""
 
 
 def lamp(rng: np.random.Generator) -> list[Part]:
     """A lamp: its parts in metres, y up, front along +z."""
-    kind = pick(rng, {name: share for name, (share, _) in KINDS.items()})
-    return KINDS[kind][1](rng)
+    return pick(rng, _KINDS)(rng)

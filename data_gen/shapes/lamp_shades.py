@@ -6,16 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.parts import Part
 from data_gen.shapes.patterns import print_of, weave
 from data_gen.shapes.primitives import ball, cylinder, rod
 from data_gen.shapes.solids import Solid, lathe
 
-__all__ = ["Shade", "sample_cloth", "sample_shade", "shell"]
+__all__ = ["BULB", "Shade", "sample_cloth", "sample_shade", "shell"]
+
+BULB = plain((250, 226, 150), "bulb")
+"""Material of bulbs and flames."""
 
 _WALL = 0.012
-_GLOW = plain((250, 226, 150), "bulb")
 _LINING = plain((238, 214, 158), "lining")
 
 _OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
@@ -62,7 +65,7 @@ class Shade:
 def sample_cloth(rng: np.random.Generator) -> Material:
     """Cloth, paper or glass of a shade: warm or colourful, plain or printed."""
     hues = (0.1, 0.12, 0.08, 0.02, 0.97, 0.33, 0.48, 0.57, 0.63, 0.78, 0.14)
-    hue = hues[int(rng.integers(len(hues)))]
+    hue = one_of(rng, hues)
     colour = tint(rng, hue, rng.uniform(0.3, 0.75), rng.uniform(0.65, 0.92), 0.05)
     choice = rng.random()
     if choice < 0.35:
@@ -75,7 +78,7 @@ def sample_cloth(rng: np.random.Generator) -> Material:
 
 def sample_shade(rng: np.random.Generator, radius: float, height: float, shapes: tuple[str, ...]) -> Shade:
     """Draw a shade of about the given size among the named shapes."""
-    shape = shapes[int(rng.integers(len(shapes)))]
+    shape = one_of(rng, shapes)
     angular = shape in ("drum", "slanted", "empire", "inverted") and rng.random() < 0.25
     segments = int(rng.choice([4, 6])) if angular else 24
     cloth = sample_cloth(rng)
@@ -131,5 +134,5 @@ def shell(style: Shade, name: str, metal: Material, bulb: bool = True) -> list[P
     if bulb:
         size = min(0.045, 0.32 * style.radius, 0.25 * style.height)
         glass = ball(size, 1.3 * size, size, 10, 8).moved(0, 0.62 * style.height - 1.1 * size)
-        parts.append(Part.of(f"{name}_bulb", glass, _GLOW))
+        parts.append(Part.of(f"{name}_bulb", glass, BULB))
     return parts

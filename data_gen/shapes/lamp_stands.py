@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.parts import Part
 from data_gen.shapes.patterns import print_of, wood
@@ -27,14 +28,14 @@ _WOODS: tuple[Colour, ...] = ((176, 122, 72), (130, 82, 48), (92, 58, 40), (200,
 
 def sample_metal(rng: np.random.Generator) -> Material:
     """Brass, black iron, steel, copper or bronze."""
-    return plain(_METALS[int(rng.integers(len(_METALS)))], "metal")
+    return plain(one_of(rng, _METALS), "metal")
 
 
 def sample_body_material(rng: np.random.Generator) -> Material:
     """Glazed or printed ceramic, or wood."""
     choice = rng.random()
     if choice < 0.25:
-        return wood(rng, _WOODS[int(rng.integers(len(_WOODS)))])
+        return wood(rng, one_of(rng, _WOODS))
     colour = tint(rng, rng.random(), rng.uniform(0.4, 0.8), rng.uniform(0.4, 0.75))
     if choice < 0.6:
         return plain(colour, "glaze")
@@ -136,7 +137,7 @@ def _pole(rng: np.random.Generator, height: float, metal: Material) -> list[Part
 
 def _turned_pole(rng: np.random.Generator, height: float) -> list[Part]:
     """A wooden column turned on a lathe."""
-    timber = wood(rng, _WOODS[int(rng.integers(len(_WOODS)))])
+    timber = wood(rng, one_of(rng, _WOODS))
     count = int(rng.integers(9, 15))
     radii = np.concatenate([[0.05], rng.uniform(0.018, 0.045, count), [0.02]])
     profile = np.stack([radii, np.linspace(0.02, height, count + 2)], 1)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Colour", "Material", "brighten", "plain", "tint"]
+__all__ = ["Colour", "Material", "brighten", "canvas", "pixel_centres", "plain", "tint"]
 
 Colour = tuple[int, int, int]
 
@@ -32,6 +32,17 @@ class Material:
 def plain(colour: Colour, name: str = "plain") -> Material:
     """A single colour."""
     return Material(name, np.array([[colour]], dtype=np.uint8))
+
+
+def canvas(colour: Colour, height: int, width: int) -> np.ndarray:
+    """An image (height, width, 3) of one colour, to draw on."""
+    return np.tile(np.array(colour, dtype=np.uint8), (height, width, 1))
+
+
+def pixel_centres(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates (u, v upwards) of the centres of pixels, each (height, width) in (0, 1)."""
+    row, column = np.mgrid[0:height, 0:width]
+    return (column + 0.5) / width, 1 - (row + 0.5) / height
 
 
 def brighten(colour: Colour, factor: float) -> Colour:

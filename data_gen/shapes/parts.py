@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import trimesh
 from PIL import Image
+from trimesh.grouping import unique_rows
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from data_gen.shapes.materials import Material
 from data_gen.shapes.solids import Solid
 
-__all__ = ["Finish", "Part", "atlas", "build_scene", "corner_normals", "pair", "pick"]
+__all__ = ["Finish", "Part", "atlas", "build_scene", "corner_normals", "pair"]
 
 _WIDTH, _BLOCK, _MARGIN = 256, 16, 8
 
@@ -78,12 +79,6 @@ class Part:
 def pair(*parts: Part) -> list[Part]:
     """The parts, all of them "left" ones, and their mirror images."""
     return [*parts, *(part.mirrored() for part in parts)]
-
-
-def pick(rng: np.random.Generator, shares: Mapping[str, float]) -> str:
-    """A random name, with probabilities proportional to the shares."""
-    weights = np.array(list(shares.values()))
-    return list(shares)[int(rng.choice(len(weights), p=weights / weights.sum()))]
 
 
 def atlas(materials: Sequence[Material]) -> tuple[np.ndarray, np.ndarray]:
@@ -150,18 +145,6 @@ def corner_normals(solids: Sequence[Solid]) -> np.ndarray:
     return total.reshape(-1, 3, 3)
 
 
-def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct rows (m, k) of integers (n, k) in order of first occurrence, and the index of each row."""
-    keys = (rows * np.random.default_rng(0).integers(1, 2**62, rows.shape[1])).sum(axis=1)  # wraps around
-    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    if not np.array_equal(rows[first][inverse], rows):  # a collision of keys
-        _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return rows[first[order]], rank[inverse.reshape(-1)]
-
-
 def build_scene(name: str, parts: Sequence[Part]) -> trimesh.Scene:
     """Join parts into a scene with one textured geometry per finish.
 
@@ -215,8 +198,9 @@ def _joined(
         first += len(solid.faces)
     columns = np.concatenate(positions), corner_normals([part.solid for part in parts]), np.concatenate(coordinates)
     corners = np.concatenate([column.reshape(3 * first, -1) for column in columns], axis=1)
-    millionths, inverse = _distinct(np.rint(corners * 1e6).astype(np.int64))
-    unique = millionths / 1e6
+    millionths = np.rint(corners * 1e6).astype(np.int64)
+    distinct, inverse = unique_rows(millionths, keep_order=True)
+    unique = millionths[distinct] / 1e6
     return trimesh.Trimesh(
         vertices=unique[:, :3],
         faces=inverse.reshape(-1, 3),

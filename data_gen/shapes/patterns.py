@@ -7,18 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_gen.shapes.materials import Colour, Material, brighten
+from data_gen.shapes.choices import one_of
+from data_gen.shapes.materials import Colour, Material, brighten, pixel_centres
 
 __all__ = ["PRINTS", "checks", "dots", "lines", "noise", "print_of", "stripes", "weave", "wheel_face", "wood"]
 
 SIZE = 112
 """Width and height of a texture in pixels."""
-
-
-def _grid() -> tuple[np.ndarray, np.ndarray]:
-    """Pixel centres as (v upwards, u), each (SIZE, SIZE) in (0, 1)."""
-    row, column = np.mgrid[0:SIZE, 0:SIZE]
-    return 1 - (row + 0.5) / SIZE, (column + 0.5) / SIZE
 
 
 def _mix(first: Colour, second: Colour, share: np.ndarray) -> np.ndarray:
@@ -27,10 +22,10 @@ def _mix(first: Colour, second: Colour, share: np.ndarray) -> np.ndarray:
     return np.round((1 - share) * np.array(first) + share * np.array(second)).astype(np.uint8)
 
 
-def noise(rng: np.random.Generator, cells: tuple[int, int], size: int = SIZE) -> np.ndarray:
-    """Smooth noise (size, size) in [0, 1]: random values on a (v, u) lattice of that many cells, interpolated."""
+def noise(rng: np.random.Generator, cells: tuple[int, int]) -> np.ndarray:
+    """Smooth noise (SIZE, SIZE) in [0, 1]: random values on a (v, u) lattice of that many cells, interpolated."""
     lattice = rng.random((cells[0] + 1, cells[1] + 1))
-    rows, columns = np.linspace(0, cells[0], size), np.linspace(0, cells[1], size)
+    rows, columns = np.linspace(0, cells[0], SIZE), np.linspace(0, cells[1], SIZE)
     r, c = np.minimum(rows.astype(int), cells[0] - 1), np.minimum(columns.astype(int), cells[1] - 1)
     fr, fc = (rows - r)[:, None], (columns - c)[None]
     fr, fc = fr * fr * (3 - 2 * fr), fc * fc * (3 - 2 * fc)
@@ -41,7 +36,7 @@ def noise(rng: np.random.Generator, cells: tuple[int, int], size: int = SIZE) ->
 
 def wood(rng: np.random.Generator, colour: Colour, boards: int = 1) -> Material:
     """Grain along v, in one or several boards side by side along u with dark joints."""
-    v, u = _grid()
+    u, v = pixel_centres(SIZE, SIZE)
     board = np.floor(u * boards)
     warp = noise(rng, (3, 6)) + 0.35 * noise(rng, (5, 24))
     phase = rng.uniform(0, 6, boards)[board.astype(int)]
@@ -56,7 +51,7 @@ def wood(rng: np.random.Generator, colour: Colour, boards: int = 1) -> Material:
 
 def weave(rng: np.random.Generator, colour: Colour) -> Material:
     """Coarse woven cloth: a basket pattern with soft mottling."""
-    v, u = _grid()
+    u, v = pixel_centres(SIZE, SIZE)
     count = int(rng.integers(9, 16))
     across, along = np.sin(np.pi * count * u) ** 2, np.sin(np.pi * count * v) ** 2
     odd = (np.floor(u * count) + np.floor(v * count)) % 2 == 0
@@ -66,7 +61,7 @@ def weave(rng: np.random.Generator, colour: Colour) -> Material:
 
 def stripes(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """Stripes along v of unequal width."""
-    _, u = _grid()
+    u, _ = pixel_centres(SIZE, SIZE)
     count, share = int(rng.integers(3, 8)), rng.uniform(0.3, 0.6)
     place = (u * count + 0.25) % 1
     thin = np.abs(place - (1 + share) / 2) < 0.05
@@ -75,7 +70,7 @@ def stripes(rng: np.random.Generator, first: Colour, second: Colour) -> Material
 
 def checks(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """Gingham: two sets of stripes whose crossings are darker."""
-    v, u = _grid()
+    u, v = pixel_centres(SIZE, SIZE)
     count = int(rng.integers(3, 7))
     across, along = (u * count + 0.25) % 1 < 0.5, (v * count + 0.25) % 1 < 0.5
     return Material("checks", _mix(first, second, 0.5 * across + 0.5 * along))
@@ -83,7 +78,7 @@ def checks(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
 
 def dots(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """Staggered round spots."""
-    v, u = _grid()
+    u, v = pixel_centres(SIZE, SIZE)
     count, radius = int(rng.integers(4, 8)), rng.uniform(0.2, 0.32)
     row = np.floor(v * count)
     x, y = (u * count + 0.5 * (row % 2)) % 1 - 0.5, v * count - row - 0.5
@@ -92,7 +87,7 @@ def dots(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
 
 def lines(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """Zigzag lines across v."""
-    v, u = _grid()
+    u, v = pixel_centres(SIZE, SIZE)
     count, teeth = int(rng.integers(4, 8)), int(rng.integers(3, 7))
     place = (v * count + 0.45 * np.abs((u * teeth) % 1 * 2 - 1)) % 1
     return Material("zigzag", _mix(first, second, place < rng.uniform(0.35, 0.55)))
@@ -104,7 +99,7 @@ PRINTS = (stripes, checks, dots, lines)
 
 def print_of(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """One of the two-coloured patterns, drawn at random."""
-    return PRINTS[int(rng.integers(len(PRINTS)))](rng, first, second)
+    return one_of(rng, PRINTS)(rng, first, second)
 
 
 def wheel_face(rng: np.random.Generator) -> Material:

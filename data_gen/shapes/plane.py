@@ -9,25 +9,25 @@ from collections.abc import Callable
 
 import numpy as np
 
-from data_gen.shapes.parts import Part, pick
+from data_gen.shapes.choices import pick
+from data_gen.shapes.parts import Part
 from data_gen.shapes.plane_civil import airliner, turboprop
 from data_gen.shapes.plane_military import fighter
 from data_gen.shapes.plane_small import biplane, glider, light
 
-__all__ = ["KINDS", "plane"]
+__all__ = ["plane"]
 
-KINDS: dict[str, tuple[float, Callable[[np.random.Generator], list[Part]]]] = {
-    "airliner": (0.4, airliner),
-    "fighter": (0.22, fighter),
-    "light": (0.16, light),
-    "biplane": (0.08, biplane),
-    "turboprop": (0.09, turboprop),
-    "glider": (0.05, glider),
+_KINDS: dict[Callable[[np.random.Generator], list[Part]], float] = {
+    airliner: 0.4,
+    fighter: 0.22,
+    light: 0.16,
+    biplane: 0.08,
+    turboprop: 0.09,
+    glider: 0.05,
 }
-"""Kinds of plane: how often each is drawn, and its builder."""
+"""How often each kind of plane is drawn."""
 
 
 def plane(rng: np.random.Generator) -> list[Part]:
     """A plane: its parts in metres, y up, nose along +z."""
-    kind = pick(rng, {name: share for name, (share, _) in KINDS.items()})
-    return KINDS[kind][1](rng)
+    return pick(rng, _KINDS)(rng)

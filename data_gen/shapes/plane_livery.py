@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
+from data_gen.shapes.materials import Colour, Material, brighten, canvas, pixel_centres, plain, tint
 
 __all__ = ["Livery", "camouflage", "sample_livery", "fuselage_side", "tail_sign", "wing_skin"]
 
@@ -40,17 +40,6 @@ def sample_livery(rng: np.random.Generator) -> Livery:
     return Livery(base, accent, plain((128, 132, 140), "metal"))
 
 
-def _field(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel centres as (u, v upwards), each (height, width) in (0, 1)."""
-    row, column = np.mgrid[0:height, 0:width]
-    return (column + 0.5) / width, 1 - (row + 0.5) / height
-
-
-def _canvas(colour: Colour, height: int, width: int) -> np.ndarray:
-    """An image (height, width, 3) of one colour."""
-    return np.tile(np.array(colour, dtype=np.uint8), (height, width, 1))
-
-
 def fuselage_side(
     rng: np.random.Generator, livery: Livery, windows: tuple[float, float] | None, cockpit: bool
 ) -> Material:
@@ -65,8 +54,8 @@ def fuselage_side(
     Returns:
         The material, for coordinates projected along x.
     """
-    u, v = _field(_HIGH, _WIDE)
-    image = _canvas(livery.base, _HIGH, _WIDE)
+    u, v = pixel_centres(_HIGH, _WIDE)
+    image = canvas(livery.base, _HIGH, _WIDE)
     style = int(rng.integers(6))
     low = rng.uniform(0.3, 0.42)
     if style == 0:
@@ -101,9 +90,9 @@ def fuselage_side(
 
 def tail_sign(rng: np.random.Generator, livery: Livery) -> Material:
     """A fin's two sides: bands, a disc, a chevron or rays, for coordinates projected along x."""
-    u, v = _field(_TALL, _TALL)
+    u, v = pixel_centres(_TALL, _TALL)
     first, second = (livery.accent, livery.base) if rng.random() < 0.7 else (livery.base, livery.accent)
-    image = _canvas(first, _TALL, _TALL)
+    image = canvas(first, _TALL, _TALL)
     style = int(rng.integers(5))
     if style == 0:
         image[(np.floor((v + 0.4 * u) * rng.uniform(4, 7)) % 2) == 0] = second
@@ -122,8 +111,8 @@ def tail_sign(rng: np.random.Generator, livery: Livery) -> Material:
 
 def wing_skin(rng: np.random.Generator, colour: Colour, accent: Colour) -> Material:
     """A wing unrolled: trailing edge at u = 0 and 1, root at v = 0; flaps, panel lines, a coloured tip."""
-    u, v = _field(_TALL, _TALL)
-    image = _canvas(colour, _TALL, _TALL)
+    u, v = pixel_centres(_TALL, _TALL)
+    image = canvas(colour, _TALL, _TALL)
     image[np.abs(u - 0.5) < 0.07] = brighten(colour, 1.12)
     edge = np.minimum(u, 1 - u)
     for low, high in ((0.06, 0.44), (0.47, 0.66), (0.69, 0.92)):
@@ -143,7 +132,7 @@ def camouflage(rng: np.random.Generator, dark: Colour, light: Colour) -> Materia
     f = f * f * (3 - 2 * f)
     rows = lattice[i] * (1 - f)[:, None] + lattice[i + 1] * f[:, None]
     field = rows[:, i] * (1 - f) + rows[:, i + 1] * f
-    image = _canvas(light, _TALL, _TALL)
+    image = canvas(light, _TALL, _TALL)
     image[field > 0.48] = dark
     if rng.random() < 0.5:
         image[field < 0.3] = brighten(dark, 0.6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.materials import Colour, Material, brighten, plain, tint
 from data_gen.shapes.parts import Part, pair
 from data_gen.shapes.plane_livery import camouflage
@@ -26,7 +27,7 @@ def _skins(rng: np.random.Generator) -> tuple[Material, Material]:
     """Main and secondary material."""
     choice = rng.random()
     if choice < 0.55:
-        dark, light = _PAIRS[int(rng.integers(len(_PAIRS)))]
+        dark, light = one_of(rng, _PAIRS)
         return camouflage(rng, dark, light), plain(light, "plain")
     if choice < 0.85:
         level = int(rng.integers(96, 150))

@@ -6,8 +6,6 @@ otherwise, in the unit of its arguments. Outlines that are to be lofted together
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
 __all__ = ["airfoil", "ellipse", "polygon_area", "rectangle", "rounded_rectangle", "superellipse", "triangulate"]
@@ -66,7 +64,7 @@ def superellipse(width: float, height: float, exponent: float, corners: int = 16
     return np.stack([x, y], 1)
 
 
-def airfoil(chord: float, thickness: float, steps: int = 6) -> np.ndarray:
+def airfoil(chord: float, thickness: float, steps: int) -> np.ndarray:
     """Symmetric wing section after the NACA four-digit thickness law, with a blunt trailing edge.
 
     Args:
@@ -115,22 +113,12 @@ def triangulate(corners: np.ndarray) -> np.ndarray:
         Indices (n - 2, 3) into `corners`, counter-clockwise, using the corners only. An outline that crosses itself,
         so that no ear is left although more than three corners remain, is a ValueError.
     """
-    # The two ends of a solid, its mirror image and its like on the other side have the same outline.
-    return _triangulated(np.ascontiguousarray(corners, dtype=np.float64).tobytes())
-
-
-@lru_cache(maxsize=256)
-def _triangulated(outline: bytes) -> np.ndarray:
-    corners = np.frombuffer(outline).reshape(-1, 2)
     turns = _cross(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0))
     edges = np.roll(corners, -1, axis=0) - corners
     turned = np.arctan2(turns, (edges * np.roll(edges, 1, axis=0)).sum(axis=1)).sum()
     if (turns > 1e-9 * np.abs(turns).max()).all() and turned < 3 * np.pi:
-        triangles = _strip(len(corners))
-    else:
-        triangles = np.array(_ears(corners))
-    triangles.flags.writeable = False
-    return triangles
+        return _strip(len(corners))
+    return np.array(_ears(corners))
 
 
 def _ears(corners: np.ndarray) -> list[tuple[int, ...]]:

@@ -1,4 +1,4 @@
-"""Watertight solids with a known volume: lofts, lathes and sweeps.
+"""Watertight solids with a known volume: lofts, lathes and sweeps, and what can be done with any solid.
 
 A `Solid` has its exact volume, computed from its parameters and not from its triangles, so that holes or reversed faces
 show up as a difference between the two. Right-handed axes, y up. Faces are counter-clockwise
@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import trimesh
 
 from data_gen.shapes.profiles import polygon_area, triangulate
 
-__all__ = ["Solid", "lathe", "loft", "rotation", "skin", "sweep"]
+__all__ = ["Solid", "collapsed", "lathe", "loft", "merged", "rotation", "signed_volume", "skin", "sweep"]
 
 _AXES = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
 """World axis of the (first, second) coordinate of an outline and of the direction it is drawn along; cyclic, so that
@@ -49,19 +48,26 @@ class Solid:
 
     def turned(self, axis: str, degrees: float) -> Solid:
         """The solid turned about a world axis through the origin, counter-clockwise seen from the axis' tip."""
-        return replace(self, vertices=self.vertices @ rotation(axis, degrees).T)
+        return self.transformed(rotation(axis, degrees))
 
     def scaled(self, x: float, y: float, z: float) -> Solid:
-        """The solid stretched by positive factors about the origin."""
-        return replace(self, vertices=self.vertices * np.array([x, y, z]), volume=self.volume * x * y * z)
+        """The solid stretched about the origin."""
+        return self.transformed(np.diag([x, y, z]))
 
     def mirrored(self) -> Solid:
-        """The solid reflected in the plane x = 0, its faces reversed to stay the right way out."""
+        """The solid reflected in the plane x = 0."""
+        return self.scaled(-1.0, 1.0, 1.0)
+
+    def transformed(self, linear: np.ndarray, offset: np.ndarray | float = 0.0) -> Solid:
+        """The solid under the map p -> linear p + offset; one that reflects reverses the faces, which stay outside."""
+        determinant = float(np.linalg.det(linear))
+        order = slice(None, None, -1 if determinant < 0 else 1)
         return replace(
             self,
-            vertices=self.vertices * np.array([-1.0, 1.0, 1.0]),
-            faces=self.faces[:, ::-1],
-            uv=self.uv[:, ::-1],
+            vertices=self.vertices @ linear.T + offset,
+            faces=self.faces[:, order],
+            uv=self.uv[:, order],
+            volume=self.volume * abs(determinant),
         )
 
     def creased(self, degrees: float) -> Solid:
@@ -103,10 +109,6 @@ class Solid:
         uv[side, :, 0] = np.clip(uv[side, :, 0] * times - tile[side, None], 0, 1)
         return replace(self, uv=uv)
 
-    def mesh(self) -> trimesh.Trimesh:
-        """The bare geometry as trimesh sees it, vertices as they are (no merging, no repair)."""
-        return trimesh.Trimesh(self.vertices, self.faces, process=False)
-
 
 def rotation(axis: str, degrees: float) -> np.ndarray:
     """Rotation matrix (3, 3) about a world axis, counter-clockwise seen from the axis' tip."""
@@ -117,6 +119,25 @@ def rotation(axis: str, degrees: float) -> np.ndarray:
     matrix[first, first] = matrix[second, second] = cosine
     matrix[second, first], matrix[first, second] = sine, -sine
     return matrix
+
+
+def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Volume inside triangles (F, 3) that are counter-clockwise seen from outside, by the divergence theorem."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    return float(np.einsum("fk,fk->", a, np.cross(b, c)) / 6)
+
+
+def merged(solids: Sequence[Solid]) -> Solid:
+    """Several solids as one; its volume is the sum of theirs, and where they overlap is counted twice."""
+    starts = np.cumsum([0, *(len(solid.vertices) for solid in solids[:-1])])
+    return Solid(
+        np.concatenate([solid.vertices for solid in solids]),
+        np.concatenate([solid.faces + start for solid, start in zip(solids, starts, strict=True)]),
+        np.concatenate([solid.uv for solid in solids]),
+        np.concatenate([solid.cells for solid in solids]),
+        sum(solid.volume for solid in solids),
+        solids[0].crease,
+    )
 
 
 def skin(rings: np.ndarray, wrap: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -144,6 +165,25 @@ def skin(rings: np.ndarray, wrap: bool) -> tuple[np.ndarray, np.ndarray, np.ndar
     uv = np.stack([np.take_along_axis(u, order, -1), np.take_along_axis(v, order, -1)], -1).reshape(-1, 3, 2)
     cells = np.repeat(np.stack([i, j], -1).reshape(-1, 2), 2, axis=0)
     return faces, uv, cells, forward
+
+
+def collapsed(solid: Solid, starts: Sequence[int], around: int) -> Solid:
+    """The solid with rings of `around` vertices that begin at some indices each made one point, their first vertex.
+
+    Faces that lose their area are dropped, as are vertices without a face.
+    """
+    faces = solid.faces
+    for start in starts:
+        faces = np.where((faces >= start) & (faces < start + around), start, faces)
+    keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    used, faces = np.unique(faces[keep], return_inverse=True)
+    return replace(
+        solid,
+        vertices=solid.vertices[used],
+        faces=faces.reshape(-1, 3),
+        uv=solid.uv[keep],
+        cells=solid.cells[keep],
+    )
 
 
 def _cap(outline: np.ndarray, start: int, last: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -241,13 +281,8 @@ def lathe(profile: Sequence[tuple[float, float]] | np.ndarray, segments: int = 1
         faces, uv, cells, _ = skin(rings, wrap=True)
         return Solid(rings.reshape(-1, 3), faces, uv, cells, volume)
     faces, uv, cells, _ = _closed(rings, circle, circle)
-    vertices = rings.reshape(-1, 3)
-    for tip, start in ((0, 0), (-1, (len(points) - 1) * segments)):
-        if points[tip, 0] == 0:  # the end ring is one point: keep its first vertex and drop what lost its area
-            faces = np.where((faces >= start) & (faces < start + segments), start, faces)
-    keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    used, faces = np.unique(faces[keep], return_inverse=True)
-    return Solid(vertices[used], faces.reshape(-1, 3), uv[keep], cells[keep], volume)
+    tips = [start for end, start in ((0, 0), (-1, (len(points) - 1) * segments)) if points[end, 0] == 0]
+    return collapsed(Solid(rings.reshape(-1, 3), faces, uv, cells, volume), tips, segments)
 
 
 def sweep(path: Sequence[Sequence[float]] | np.ndarray, outline: np.ndarray, up: Sequence[float] = (0, 1, 0)) -> Solid:

@@ -6,6 +6,7 @@ import colorsys
 
 import numpy as np
 
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.materials import Colour
 
 __all__ = ["MATERIALS", "loud", "natural", "near", "random_colour"]
@@ -58,8 +59,7 @@ def near(rng: np.random.Generator, colour: Colour, spread: float) -> Colour:
 
 def natural(rng: np.random.Generator) -> Colour:
     """A colour near that of one of `MATERIALS`."""
-    names = list(MATERIALS)
-    return near(rng, MATERIALS[names[int(rng.integers(len(names)))]], 14)
+    return near(rng, one_of(rng, list(MATERIALS.values())), 14)
 
 
 def loud(rng: np.random.Generator) -> Colour:

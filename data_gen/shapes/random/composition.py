@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_gen.shapes.parts import Part, pick
+from data_gen.shapes.choices import one_of, pick
+from data_gen.shapes.parts import Part
 from data_gen.shapes.primitives import box, cylinder
 from data_gen.shapes.random.cuts import difference
 from data_gen.shapes.random.painting import Paint
 from data_gen.shapes.random.primitives import primitive
 from data_gen.shapes.random.structures import structure
-from data_gen.shapes.random.tubes import merged, moved
-from data_gen.shapes.solids import Solid, rotation
+from data_gen.shapes.solids import Solid, merged, rotation
 
 __all__ = ["COUNTS", "composition", "random_rotation"]
 
-COUNTS = (5, 5, 5, 4, 4, 3, 2, 1, 1)
-"""Relative frequencies of objects with 1, 2, ... 9 primitives."""
+COUNTS = {1: 5, 2: 5, 3: 5, 4: 4, 5: 4, 6: 3, 7: 2, 8: 1, 9: 1}
+"""Relative frequencies of objects by their number of primitives."""
 
 RELIEF = 0.5
 """Share of the primitives with a height field."""
@@ -82,10 +82,10 @@ def _turn(rng: np.random.Generator) -> np.ndarray:
 
 def _piece(rng: np.random.Generator, thin: bool) -> Solid:
     """A primitive with its height field, its proportions and its rotation, about the origin."""
-    solid = moved(primitive(rng, RELIEF), np.diag(_half_axes(rng, thin)))
+    solid = primitive(rng, RELIEF).scaled(*_half_axes(rng, thin))
     if rng.random() < CUTS:
         solid = _cut(rng, solid)
-    return moved(solid, _turn(rng))
+    return solid.transformed(_turn(rng))
 
 
 def _cut(rng: np.random.Generator, solid: Solid) -> Solid:
@@ -93,8 +93,8 @@ def _cut(rng: np.random.Generator, solid: Solid) -> Solid:
     left = solid
     low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     for _ in range(int(rng.integers(1, 4))):
-        tool = moved(primitive(rng, 0.1), np.diag((high - low) * rng.uniform(0.12, 0.45, 3)))
-        tool = moved(tool, _turn(rng), low + (high - low) * rng.uniform(0.0, 1.0, 3))
+        tool = primitive(rng, 0.1).scaled(*(high - low) * rng.uniform(0.12, 0.45, 3))
+        tool = tool.transformed(_turn(rng), low + (high - low) * rng.uniform(0.0, 1.0, 3))
         smaller = difference(left, tool)
         if smaller is not None and smaller.volume > 0.25 * solid.volume:
             left = smaller
@@ -112,27 +112,25 @@ def _arranged(rng: np.random.Generator, solid: Solid) -> Solid:
         mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
         shift = np.zeros(3)
         shift[axis] = extents[axis] * rng.uniform(0.3, 0.75)
-        return merged([moved(solid, np.eye(3), shift), moved(solid, mirror, apart - shift)])
+        return merged([solid.moved(*shift), solid.transformed(mirror, apart - shift)])
     if kind == "row":
         count, axis = min(most, int(rng.integers(2, 6))), int(rng.integers(3))
         step = np.zeros(3)
         step[axis] = extents[axis] * rng.uniform(0.6, 1.2)
         size = rng.uniform(0.5, 0.9)
         places = (np.arange(count) - (count - 1) / 2)[:, None] * step
-        return merged([moved(solid, size * np.eye(3), place + k * apart) for k, place in enumerate(places)])
+        return merged([solid.transformed(size * np.eye(3), place + k * apart) for k, place in enumerate(places)])
     if kind == "ring":
         count = min(most, int(rng.integers(3, 9)))
-        small = moved(solid, rng.uniform(0.3, 0.6) * np.eye(3))
-        outwards = np.array([0.0, 0.0, rng.uniform(0.3, 0.9)])
-        turns = [rotation("y", 360.0 * k / count) for k in range(count)]
-        outer = moved(small, np.eye(3), outwards)
-        return merged([moved(outer, turn, k * apart) for k, turn in enumerate(turns)])
+        small = solid.transformed(rng.uniform(0.3, 0.6) * np.eye(3))
+        outer = small.moved(z=rng.uniform(0.3, 0.9))
+        return merged([outer.transformed(rotation("y", 360.0 * k / count), k * apart) for k in range(count)])
     return solid
 
 
 def _attached(rng: np.random.Generator, solid: Solid, others: list[Solid]) -> Solid:
     """The solid moved to the outside of one of the others, most often into it a little, some apart."""
-    other = others[int(rng.integers(len(others)))]
+    other = one_of(rng, others)
     direction = rng.normal(size=3)
     if rng.random() < 0.5:
         direction = np.where(np.arange(3) == int(rng.integers(3)), rng.choice([-1.0, 1.0]), 0.1 * direction)
@@ -140,7 +138,7 @@ def _attached(rng: np.random.Generator, solid: Solid, others: list[Solid]) -> So
     middle = (other.vertices.min(axis=0) + other.vertices.max(axis=0)) / 2
     reach = ((other.vertices - middle) @ direction).max() + (solid.vertices @ -direction).max()
     share = rng.uniform(1.05, 1.5) if rng.random() < 0.08 else rng.uniform(0.45, 0.95)
-    return moved(solid, np.eye(3), middle + share * reach * direction)
+    return solid.moved(*middle + share * reach * direction)
 
 
 def _base(rng: np.random.Generator, solids: list[Solid]) -> Solid:
@@ -151,23 +149,21 @@ def _base(rng: np.random.Generator, solids: list[Solid]) -> Solid:
     thick = rng.uniform(0.03, 0.3)
     plate = box(width, thick, depth) if rng.random() < 0.6 else cylinder(0.5, thick, 24).scaled(width, 1.0, depth)
     middle = (low + high) / 2
-    return moved(plate, np.eye(3), np.array([middle[0], low[1] - 0.3 * thick, middle[2]]))
+    return plate.moved(middle[0], low[1] - 0.3 * thick, middle[2])
 
 
 def _composed(rng: np.random.Generator) -> list[Solid]:
     """One to nine primitives, some of them repeated."""
-    count = 1 + int(rng.choice(len(COUNTS), p=np.array(COUNTS) / sum(COUNTS)))
     solids: list[Solid] = []
-    for _ in range(count):
+    for _ in range(pick(rng, COUNTS)):
         solid = _arranged(rng, _piece(rng, thin=bool(solids)))
         solids.append(_attached(rng, solid, solids) if solids else solid)
     if rng.random() < 0.12:
-        mirror = np.diag([-1.0, 1.0, 1.0])
         edge = np.concatenate([solid.vertices for solid in solids])[:, 0]
-        shift = np.array([-edge.min() - rng.uniform(0.1, 0.5) * np.ptp(edge), 0.0, 0.0])
-        shifted = [moved(solid, np.eye(3), shift) for solid in solids]
-        apart = np.array([0.0, APART, APART]) * np.ptp(edge)
-        solids = [merged([solid, moved(solid, mirror, apart)]) for solid in shifted]
+        shift = -edge.min() - rng.uniform(0.1, 0.5) * np.ptp(edge)
+        shifted = [solid.moved(shift) for solid in solids]
+        apart = APART * np.ptp(edge)
+        solids = [merged([solid, solid.mirrored().moved(0.0, apart, apart)]) for solid in shifted]
     return solids
 
 
@@ -186,4 +182,4 @@ def composition(rng: np.random.Generator) -> list[Part]:
         solids.append(_base(rng, solids))
     turn = rotation("y", rng.uniform(0, 360)) if rng.random() < upright else random_rotation(rng)
     paint = Paint(rng)
-    return [paint.part(f"piece_{index}", moved(solid, turn)) for index, solid in enumerate(solids)]
+    return [paint.part(f"piece_{index}", solid.transformed(turn)) for index, solid in enumerate(solids)]

@@ -8,8 +8,7 @@ from __future__ import annotations
 import manifold3d
 import numpy as np
 
-from data_gen.shapes.random.tubes import signed_volume
-from data_gen.shapes.solids import Solid
+from data_gen.shapes.solids import Solid, signed_volume
 
 __all__ = ["CUT", "difference"]
 

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from data_gen.shapes.primitives import box, cushion, tapered
-from data_gen.shapes.random.primitives import PRIMITIVES, Maker, ball, cylinder, lathe, loft, pebble, primitive
-from data_gen.shapes.random.tubes import merged, moved
-from data_gen.shapes.solids import Solid
+from data_gen.shapes.random.primitives import Maker, ball, cylinder, lathe, loft, pebble, primitive
+from data_gen.shapes.solids import Solid, merged
 
-__all__ = ["BODIES", "LIMBS", "crate", "filling", "one_of", "sides"]
+__all__ = ["BODIES", "LIMBS", "crate", "filling", "sides"]
 
 Corner = Sequence[float] | np.ndarray
 
@@ -31,20 +30,15 @@ def filling(
     Returns:
         The solid.
     """
-    solid = one_of(rng, makers, relief)
+    solid = primitive(rng, relief, makers)
     bottom, top = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     scale = (np.asarray(high, dtype=float) - np.asarray(low, dtype=float)) / (top - bottom)
-    return moved(solid, np.diag(scale), np.asarray(low, dtype=float) - scale * bottom)
-
-
-def one_of(rng: np.random.Generator, makers: tuple[Maker, ...], relief: float) -> Solid:
-    """One of some primitives, with a height field with probability `relief`."""
-    return primitive(rng, relief, {maker: PRIMITIVES.get(maker, 1.0) for maker in makers})
+    return solid.transformed(np.diag(scale), np.asarray(low, dtype=float) - scale * bottom)
 
 
 def sides(solid: Solid) -> Solid:
     """The solid and its mirror image at x = 0."""
-    return merged([solid, moved(solid, np.diag([-1.0, 1.0, 1.0]))])
+    return merged([solid, solid.mirrored()])
 
 
 def crate(rng: np.random.Generator, _fine: bool) -> Solid:

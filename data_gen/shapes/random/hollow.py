@@ -6,8 +6,8 @@ import numpy as np
 
 from data_gen.shapes.profiles import ellipse, rectangle
 from data_gen.shapes.random.outlines import AROUND, outline
-from data_gen.shapes.random.tubes import bar, merged, subdivided, surface
-from data_gen.shapes.solids import Solid
+from data_gen.shapes.random.tubes import bar, subdivided, surface
+from data_gen.shapes.solids import Solid, merged
 
 __all__ = ["arch", "pipe", "vessel", "wire_cage"]
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.materials import Material
 from data_gen.shapes.parts import Finish, Part
 from data_gen.shapes.random.cuts import CUT
@@ -29,21 +30,19 @@ class Paint:
         self._rng = rng
         count = int(rng.choice([1, 2, 3, 4, 0], p=[0.08, 0.14, 0.18, 0.1, 0.5]))
         self._materials = [random_material(rng) for _ in range(count)]
-        self.finishes = [_FINISHES[int(rng.integers(len(_FINISHES)))] for _ in range(int(rng.integers(1, 3)))]
+        self.finishes = [one_of(rng, _FINISHES) for _ in range(int(rng.integers(1, 3)))]
 
     def draw(self) -> Material:
         """A material for the next surface."""
         if self._materials:
-            return self._materials[int(self._rng.integers(len(self._materials)))]
+            return one_of(self._rng, self._materials)
         return random_material(self._rng)
 
     def part(self, name: str, solid: Solid) -> Part:
         """A painted solid: some have other materials on their flat ends, and most where they were cut."""
-        part = replace(
-            Part.of(name, solid, self.draw()), finish=self.finishes[int(self._rng.integers(len(self.finishes)))]
-        )
+        part = replace(Part.of(name, solid, self.draw()), finish=one_of(self._rng, self.finishes))
         if self._rng.random() < 0.25 and (solid.cells[:, 0] == -1).any():
-            part = part.capped(self.draw(), *((True, False), (False, True), (True, True))[int(self._rng.integers(3))])
+            part = part.capped(self.draw(), *one_of(self._rng, ((True, False), (False, True), (True, True))))
         cut = solid.cells[:, 0] == CUT
         if cut.any() and self._rng.random() < 0.6:
             part = part.painted(cut, self.draw())

@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from data_gen.shapes import patterns
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.materials import Material
 from data_gen.shapes.random.colours import random_colour
 
@@ -49,7 +50,7 @@ def _pixels(name: str) -> np.ndarray:
 
 def photograph(rng: np.random.Generator) -> Material:
     """A square piece of a photograph, of any size and any of eight orientations; some in two other colours."""
-    name = list(PHOTOGRAPHS)[int(rng.integers(len(PHOTOGRAPHS)))]
+    name = one_of(rng, list(PHOTOGRAPHS))
     pixels = _pixels(name)
     side = int(rng.uniform(0.25, 1.0) * min(pixels.shape[:2]))
     top, left = (int(rng.integers(extent - side + 1)) for extent in pixels.shape[:2])

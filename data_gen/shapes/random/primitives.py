@@ -6,18 +6,19 @@ arXiv 2406.09371) composes cubes, balls, cylinders, cones and tori; lathes, loft
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from data_gen.shapes.choices import pick
 from data_gen.shapes.profiles import ellipse, rectangle
 from data_gen.shapes.random.hollow import arch, pipe, vessel, wire_cage
 from data_gen.shapes.random.outlines import AROUND, blob, outline
 from data_gen.shapes.random.relief import random_relief
-from data_gen.shapes.random.tubes import bar, merged, moved, subdivided, tube
-from data_gen.shapes.solids import Solid
+from data_gen.shapes.random.tubes import bar, subdivided, tube
+from data_gen.shapes.solids import Solid, merged
 
-__all__ = ["FRAMES", "PRIMITIVES", "Maker", "primitive", "smooth_curve"]
+__all__ = ["FRAMES", "PRIMITIVES", "Maker", "primitive"]
 
 Maker = Callable[[np.random.Generator, bool], Solid]
 
@@ -125,19 +126,19 @@ def loft(rng: np.random.Generator, fine: bool) -> Solid:
     return tube(spine, sections).creased(crease)
 
 
-def smooth_curve(rng: np.random.Generator, knots: int, stations: int) -> np.ndarray:
-    """A random smooth curve (stations, 3) that fills the cube of side 2."""
+def _smooth_curve(rng: np.random.Generator, knots: int) -> np.ndarray:
+    """A random smooth curve (20, 3) that fills the cube of side 2."""
     walk = np.cumsum(rng.normal(size=(knots, 3)) * rng.uniform(0.2, 1.0, 3) + rng.normal(size=3) * 0.5, axis=0)
     from scipy.interpolate import CubicSpline
 
-    curve = CubicSpline(np.arange(knots), walk)(np.linspace(0, knots - 1, stations))
+    curve = CubicSpline(np.arange(knots), walk)(np.linspace(0, knots - 1, 20))
     curve -= (curve.min(axis=0) + curve.max(axis=0)) / 2
     return curve / np.abs(curve).max()
 
 
 def bent_tube(rng: np.random.Generator, fine: bool) -> Solid:
     """A tube, round or not, along a random smooth curve."""
-    spine = 0.9 * smooth_curve(rng, int(rng.integers(3, 6)), 20)
+    spine = 0.9 * _smooth_curve(rng, int(rng.integers(3, 6)))
     section, crease = (ellipse(1.0, 1.0, AROUND), 60.0) if rng.random() < 0.6 else outline(rng)
     widths = rng.uniform(0.05, 0.2) * _smooth(np.linspace(0, 1, 3), rng.uniform(0.6, 1.4, 3), np.linspace(0, 1, 20))
     if rng.random() < 0.2:
@@ -227,23 +228,22 @@ FRAMES = (wire_box, wire_cage, grille, spring)
 """Primitives made of bars, too thin for displacement."""
 
 
-def primitive(rng: np.random.Generator, relief: float, shares: Mapping[Maker, float] = PRIMITIVES) -> Solid:
+def primitive(rng: np.random.Generator, relief: float, makers: Iterable[Maker] = PRIMITIVES) -> Solid:
     """A random primitive, its longest extent 2, about the origin.
 
     Args:
         rng: source of every choice.
         relief: probability of a height field.
-        shares: the primitives, with relative frequencies.
+        makers: the primitives to choose from; one that is not in `PRIMITIVES` is as frequent as 1.0 there.
 
     Returns:
         The solid.
     """
-    makers, weights = list(shares), np.array(list(shares.values()))
-    maker = makers[int(rng.choice(len(makers), p=weights / weights.sum()))]
+    maker = pick(rng, {maker: PRIMITIVES.get(maker, 1.0) for maker in makers})
     fine = maker not in FRAMES and bool(rng.random() < relief)
     solid = maker(rng, fine)
     if fine:
         solid = random_relief(rng, solid)
     low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     scale = 2 / (high - low).max()
-    return moved(solid, scale * np.eye(3), -scale * (low + high) / 2)
+    return solid.transformed(scale * np.eye(3), -scale * (low + high) / 2)

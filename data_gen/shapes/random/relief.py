@@ -9,9 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from data_gen.shapes.parts import pick
-from data_gen.shapes.random.tubes import signed_volume
-from data_gen.shapes.solids import Solid
+from data_gen.shapes.choices import pick
+from data_gen.shapes.solids import Solid, signed_volume
 
 __all__ = ["displaced", "random_relief", "vertex_normals"]
 

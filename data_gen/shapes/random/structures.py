@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from data_gen.shapes.choices import one_of
 from data_gen.shapes.primitives import box
-from data_gen.shapes.random.fillings import BODIES, LIMBS, crate, filling, one_of, sides
+from data_gen.shapes.random.fillings import BODIES, LIMBS, crate, filling, sides
 from data_gen.shapes.random.hollow import arch, vessel
-from data_gen.shapes.random.primitives import ball, bent_tube, cone, cylinder, lathe, loft, pebble, torus
-from data_gen.shapes.random.tubes import bar, merged, moved
-from data_gen.shapes.solids import Solid, rotation
+from data_gen.shapes.random.primitives import ball, bent_tube, cone, cylinder, lathe, loft, pebble, primitive, torus
+from data_gen.shapes.random.tubes import bar
+from data_gen.shapes.solids import Solid, merged, rotation
 
 __all__ = ["STRUCTURES", "structure"]
 
@@ -26,7 +27,7 @@ def table(rng: np.random.Generator) -> list[Solid]:
     inset = rng.uniform(0.75, 0.97)
     leg = filling(rng, LIMBS, (-foot, 0, -foot), (foot, high + 0.02, foot))
     x, z = inset * width - foot, inset * depth - foot
-    parts.append(merged([moved(leg, np.eye(3), np.array([a * x, 0, b * z])) for a in (-1, 1) for b in (-1, 1)]))
+    parts.append(merged([leg.moved(a * x, 0, b * z) for a in (-1, 1) for b in (-1, 1)]))
     if rng.random() < 0.5:
         level = rng.uniform(0.15, 0.6) * high
         rails = [bar(np.array([-x, level, b * z]), np.array([x, level, b * z]), 0.5 * foot, 4) for b in (-1, 1)]
@@ -44,12 +45,12 @@ def cart(rng: np.random.Generator) -> list[Solid]:
     radius, pairs = rng.uniform(0.18, 0.5), int(rng.integers(1, 5))
     floor = radius * rng.uniform(0.5, 1.3)
     parts = [filling(rng, BODIES, (-width, floor, -length), (width, floor + high, length))]
-    wheel = one_of(rng, (cylinder, torus, torus, lathe), 0.2)
-    wheel = moved(wheel, rotation("z", 90.0) @ np.diag([1.0, rng.uniform(0.15, 0.4), 1.0]))
-    wheel = moved(wheel, radius / np.abs(wheel.vertices[:, 1:]).max() * np.eye(3))
+    wheel = primitive(rng, 0.2, (cylinder, torus, lathe))
+    wheel = wheel.transformed(rotation("z", 90.0) @ np.diag([1.0, rng.uniform(0.15, 0.4), 1.0]))
+    wheel = wheel.transformed(radius / np.abs(wheel.vertices[:, 1:]).max() * np.eye(3))
     places = np.linspace(-0.75, 0.75, pairs) * length if pairs > 1 else np.array([rng.uniform(-0.3, 0.3)])
     out = width * rng.uniform(0.9, 1.15)
-    parts.append(merged([sides(moved(wheel, np.eye(3), np.array([out, radius, z]))) for z in places]))
+    parts.append(merged([sides(wheel.moved(out, radius, z)) for z in places]))
     top = floor + high
     back, front = np.sort(rng.uniform(-0.9, 0.9, 2)) * length
     front = max(front, back + 0.3)
@@ -76,7 +77,7 @@ def figure(rng: np.random.Generator) -> list[Solid]:
     parts.append(
         filling(
             rng,
-            (ball, ball, pebble, crate, lathe),
+            (ball, pebble, crate, lathe),
             (-head, neck, forward - head),
             (head, neck + 2 * head, forward + head),
             0.35,
@@ -85,17 +86,15 @@ def figure(rng: np.random.Generator) -> list[Solid]:
     limb = filling(rng, LIMBS, (-foot, 0, -foot), (foot, leg + 0.15, foot))
     places = (0.0,) if rng.random() < 0.5 else (-0.7 * depth, 0.7 * depth)
     x = max(0.7 * width, foot)
-    parts.append(merged([sides(moved(limb, np.eye(3), np.array([x, 0.0, z]))) for z in places]))
+    parts.append(merged([sides(limb.moved(x, 0.0, z)) for z in places]))
     if rng.random() < 0.8:
-        arm = one_of(rng, (bent_tube, cylinder, loft, lathe), 0.1)
-        arm = moved(arm, np.diag([rng.uniform(0.08, 0.2), rng.uniform(0.3, 0.6), rng.uniform(0.08, 0.2)]))
-        arm = moved(arm, rotation("x", rng.uniform(-90, 30)) @ rotation("z", rng.uniform(10, 100)))
-        parts.append(
-            sides(moved(arm, np.eye(3), np.array([width - arm.vertices[:, 0].min() - 0.08, leg + 0.75 * high, 0])))
-        )
+        arm = primitive(rng, 0.1, (bent_tube, cylinder, loft, lathe))
+        arm = arm.scaled(rng.uniform(0.08, 0.2), rng.uniform(0.3, 0.6), rng.uniform(0.08, 0.2))
+        arm = arm.transformed(rotation("x", rng.uniform(-90, 30)) @ rotation("z", rng.uniform(10, 100)))
+        parts.append(sides(arm.moved(width - arm.vertices[:, 0].min() - 0.08, leg + 0.75 * high)))
     if rng.random() < 0.5:
         eye = filling(rng, (ball,), (-0.07,) * 3, (0.07,) * 3, 0)
-        parts.append(sides(moved(eye, np.eye(3), np.array([0.45 * head, neck + 1.2 * head, forward + 0.85 * head]))))
+        parts.append(sides(eye.moved(0.45 * head, neck + 1.2 * head, forward + 0.85 * head)))
     if rng.random() < 0.4:
         top = neck + 2 * head
         parts.append(
@@ -116,21 +115,21 @@ def house(rng: np.random.Generator) -> list[Solid]:
     for _ in range(int(rng.integers(1, 5))):
         high = rng.uniform(0.25, 1.0)
         parts.append(
-            filling(rng, (crate, crate, cylinder, loft), (-size[0], level, -size[1]), (size[0], level + high, size[1]))
+            filling(rng, (crate, cylinder, loft), (-size[0], level, -size[1]), (size[0], level + high, size[1]))
         )
         if rng.random() < 0.6:
             count, window = int(rng.integers(2, 6)), rng.uniform(0.03, 0.09)
             panes = []
             for x in np.linspace(-0.75, 0.75, count) * size[0]:
                 pane = box(2 * window, rng.uniform(0.3, 0.7) * high, 0.08).moved(x, level + 0.5 * high, size[1])
-                panes += [pane, moved(pane, np.diag([1.0, 1.0, -1.0]))]
+                panes += [pane, pane.scaled(1.0, 1.0, -1.0)]
             parts.append(merged(panes))
         level += high * rng.uniform(0.9, 1.0)
         size = size * rng.uniform(0.55, 1.05, 2)
     if rng.random() < 0.7:
         over, rise = rng.uniform(0.9, 1.4), rng.uniform(0.2, 0.9)
         low, high = (-over * size[0], level - 0.02, -over * size[1]), (over * size[0], level + rise, over * size[1])
-        parts.append(filling(rng, (cone, cone, ball, crate), low, high))
+        parts.append(filling(rng, (cone, ball, crate), low, high))
     if rng.random() < 0.35:
         steps = [box(0.8, 0.1, 0.3).moved(0, 0.05 + 0.1 * k, 1.6 - 0.16 * k) for k in range(int(rng.integers(3, 7)))]
         parts.append(merged(steps))
@@ -151,7 +150,7 @@ def tool(rng: np.random.Generator) -> list[Solid]:
         blade = filling(rng, (loft, crate, ball, arch), (0, -0.1, -0.02), (rng.uniform(0.3, 1.2), 0.1, 0.02))
         count, pitch = int(rng.integers(2, 7)), rotation("x", rng.uniform(-70, 70))
         turns = [rotation("y", 360 * k / count) @ pitch for k in range(count)]
-        parts.append(merged([moved(blade, turn, end) for turn in turns]))
+        parts.append(merged([blade.transformed(turn, end) for turn in turns]))
     if rng.random() < 0.6:
         grip = thick * rng.uniform(1.1, 1.8)
         parts.append(filling(rng, (cylinder, lathe, torus), (-grip, -length, -grip), (grip, -0.5 * length, grip)))
@@ -180,11 +179,8 @@ def plant(rng: np.random.Generator) -> list[Solid]:
     size = rng.uniform(0.12, 0.4) * np.array([1.0, rng.uniform(0.15, 1.2), rng.uniform(0.4, 1.0)])
     leaf = filling(rng, (ball, loft, pebble, cone, cylinder), -size, size, 0)
     tips = tips[: max(1, 4000 // len(leaf.faces))]
-    parts.append(
-        merged(
-            [moved(leaf, rotation("y", rng.uniform(0, 360)) @ rotation("x", rng.uniform(-50, 50)), tip) for tip in tips]
-        )
-    )
+    turns = [rotation("y", rng.uniform(0, 360)) @ rotation("x", rng.uniform(-50, 50)) for _ in tips]
+    parts.append(merged([leaf.transformed(turn, tip) for turn, tip in zip(turns, tips, strict=True)]))
     return parts
 
 
@@ -200,13 +196,12 @@ def machine(rng: np.random.Generator) -> list[Solid]:
         size[axis] = rng.uniform(0.05, 0.5)
         solid = filling(rng, (*BODIES, vessel, torus, arch, cone), place - size, place + size)
         if rng.random() < 0.3:
-            other = np.eye(3)
-            other[(axis + 1) % 3, (axis + 1) % 3] = -1.0
-            solid = merged([solid, moved(solid, other)])
+            other = np.where(np.arange(3) == (axis + 1) % 3, -1.0, 1.0)
+            solid = merged([solid, solid.scaled(*other)])
         parts.append(solid)
     for _ in range(int(rng.integers(0, 3))):
-        hose = moved(bent_tube(rng, False), np.diag(half * rng.uniform(0.8, 1.4, 3)))
-        parts.append(moved(hose, np.eye(3), rng.uniform(-0.3, 0.3, 3)))
+        hose = bent_tube(rng, False).scaled(*half * rng.uniform(0.8, 1.4, 3))
+        parts.append(hose.moved(*rng.uniform(-0.3, 0.3, 3)))
     return parts
 
 
@@ -221,7 +216,7 @@ def shelf(rng: np.random.Generator) -> list[Solid]:
     )
     if rng.random() < 0.4:
         foot = filling(rng, (cylinder, lathe), (width - 0.06, -0.1, -0.06), (width + 0.06, high + 0.2, 0.06))
-        side = merged([moved(foot, np.eye(3), np.array([0.0, 0.0, z])) for z in (-0.8 * depth, 0.8 * depth)])
+        side = merged([foot.moved(z=z) for z in (-0.8 * depth, 0.8 * depth)])
     parts.append(sides(side))
     gap = levels[1] - levels[0]
     for level in levels[:-1]:
@@ -239,4 +234,4 @@ STRUCTURES = (table, cart, figure, house, tool, plant, machine, shelf)
 
 def structure(rng: np.random.Generator) -> list[Solid]:
     """The solids of one of `STRUCTURES`, y up."""
-    return STRUCTURES[int(rng.integers(len(STRUCTURES)))](rng)
+    return one_of(rng, STRUCTURES)(rng)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from data_gen.shapes import patterns
+from data_gen.shapes.choices import pick
 from data_gen.shapes.materials import Material, plain
 from data_gen.shapes.random.colours import near, random_colour
 from data_gen.shapes.random.marks import label, sign, writing
@@ -25,7 +26,7 @@ def octaves(rng: np.random.Generator, coarsest: int, count: int) -> np.ndarray:
     total, strength = np.zeros((SIZE, SIZE)), 1.0
     for octave in range(count):
         cells = min(coarsest << octave, SIZE // 2)
-        total += strength * patterns.noise(rng, (cells, cells), SIZE)
+        total += strength * patterns.noise(rng, (cells, cells))
         strength *= 0.55
     total -= total.min()
     return total / max(total.max(), 1e-9)
@@ -159,5 +160,4 @@ TEXTURES: dict[Callable[[np.random.Generator], Material], float] = {
 
 def random_material(rng: np.random.Generator) -> Material:
     """One of `TEXTURES`."""
-    makers, shares = list(TEXTURES), np.array(list(TEXTURES.values()))
-    return makers[int(rng.choice(len(makers), p=shares / shares.sum()))](rng)
+    return pick(rng, TEXTURES)(rng)

@@ -7,21 +7,12 @@ bent curve a sweep, and with a closed one a ring.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
 
 from data_gen.shapes.profiles import ellipse
-from data_gen.shapes.solids import Solid, skin
+from data_gen.shapes.solids import Solid, collapsed, signed_volume, skin
 
-__all__ = ["bar", "frames_along", "merged", "moved", "reflected", "signed_volume", "subdivided", "surface", "tube"]
-
-
-def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Volume inside triangles (F, 3) that are counter-clockwise seen from outside, by the divergence theorem."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    return float(np.einsum("fk,fk->", a, np.cross(b, c)) / 6)
+__all__ = ["bar", "frames_along", "subdivided", "surface", "tube"]
 
 
 def subdivided(corners: np.ndarray, count: int) -> np.ndarray:
@@ -123,12 +114,8 @@ def surface(rings: np.ndarray, closed: bool = False, inner: int = 2) -> Solid:
             uv[ends] = _flat_coordinates(rings[-which], towards, whole.reshape(-1, 3)[faces[ends]])
             cells[ends] = (-1, which)
     vertices = whole.reshape(-1, 3)
-    for start in (0, (len(whole) - 1) * around):  # the innermost ring of an end is one point
-        faces = np.where((faces >= start) & (faces < start + around), start, faces)
-    keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    used, faces = np.unique(faces[keep], return_inverse=True)
-    vertices, faces = vertices[used], faces.reshape(-1, 3)
-    return Solid(vertices, faces, np.clip(uv[keep], 0, 1), cells[keep], signed_volume(vertices, faces))
+    solid = Solid(vertices, faces, np.clip(uv, 0, 1), cells, signed_volume(vertices, faces))
+    return collapsed(solid, (0, (len(whole) - 1) * around), around)  # the innermost ring of an end is one point
 
 
 def _fan(ring: np.ndarray, inner: int) -> np.ndarray:
@@ -155,28 +142,3 @@ def bar(start: np.ndarray, end: np.ndarray, radius: float, sides: int) -> Solid:
     """A straight bar between two points, of a regular section with that circumradius."""
     spine = np.stack([start, end])
     return tube(spine, np.tile(radius * ellipse(1.0, 1.0, sides), (2, 1, 1)), inner=0).creased(40 if sides < 6 else 65)
-
-
-def moved(solid: Solid, linear: np.ndarray, offset: np.ndarray | float = 0.0) -> Solid:
-    """The solid under the map x -> linear x + offset; one that reflects turns its faces over, so that they stay out."""
-    determinant = float(np.linalg.det(linear))
-    solid = replace(solid, vertices=solid.vertices @ np.asarray(linear).T + offset, volume=solid.volume * determinant)
-    return solid if determinant > 0 else reflected(solid)
-
-
-def reflected(solid: Solid) -> Solid:
-    """The solid with its faces turned over."""
-    return replace(solid, faces=solid.faces[:, ::-1], uv=solid.uv[:, ::-1], volume=-solid.volume)
-
-
-def merged(solids: Sequence[Solid]) -> Solid:
-    """Several solids as one; its volume is the sum of theirs, and where they overlap is counted twice."""
-    starts = np.cumsum([0, *(len(solid.vertices) for solid in solids[:-1])])
-    return Solid(
-        np.concatenate([solid.vertices for solid in solids]),
-        np.concatenate([solid.faces + start for solid, start in zip(solids, starts, strict=True)]),
-        np.concatenate([solid.uv for solid in solids]),
-        np.concatenate([solid.cells for solid in solids]),
-        sum(solid.volume for solid in solids),
-        solids[0].crease,
-    )

@@ -17,10 +17,10 @@ HERE = Path(__file__).parent
 def run(monkeypatch, tmp_path):
     monkeypatch.setenv("PYTHONPATH", str(HERE))
 
-    def start(kinds, workers=2, timeout=20.0, **options):
+    def start(kinds, workers=2, timeout=20.0, recycle=200, broken=False):
         items = ({"name": str(index), "kind": kind} for index, kind in enumerate(kinds))
-        settings = {"folder": str(tmp_path), "broken": options.pop("broken", False)}
-        return run_isolated("faulty_worker:serve", settings, items, workers=workers, timeout=timeout, **options)
+        settings = {"folder": str(tmp_path), "broken": broken}
+        return run_isolated("faulty_worker:serve", settings, items, workers=workers, timeout=timeout, recycle=recycle)
 
     return start
 
@@ -89,7 +89,9 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
     script = (
         "from data_gen.datasets.workers import run_isolated\n"
         f"items = iter([dict(name='0', kind='fine')] * 10**6)\n"
-        f"for o in run_isolated('faulty_worker:serve', dict(folder={str(tmp_path)!r}), items, workers=1):\n"
+        f"settings = dict(folder={str(tmp_path)!r})\n"
+        "options = dict(workers=1, timeout=300, recycle=200)\n"
+        "for o in run_isolated('faulty_worker:serve', settings, items, **options):\n"
         "    print(o.result['process'], flush=True)\n"
     )
     path = os.pathsep.join([str(HERE.parents[2]), str(HERE)])

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from mesh_writers import TETRAHEDRON, TETRAHEDRON_FACES, glb_bytes, gltf, write_glb, write_gltf, write_obj
 
-from data_gen.meshes.gltf import write_glb as exported
+from data_gen.meshes.formats.gltf import write_glb as exported
 from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts, prepare_scene
 from data_gen.rendering.mesh_renderer import MeshRenderer
 from data_gen.rendering.renderers import probe
@@ -353,7 +353,7 @@ def test_too_many_parts_to_draw_are_refused_at_once(tmp_path, monkeypatch):
         MeshError, match=r"a\.glb: expected at most 20000 parts, found 100000 instances; leave some out"
     ):
         load_mesh(written(100_000))
-    monkeypatch.setattr("data_gen.meshes.gltf.read.MAX_PARTS", 5)
+    monkeypatch.setattr("data_gen.meshes.formats.gltf.read.MAX_PARTS", 5)
     with pytest.raises(MeshError, match="expected at most 5 parts, found 6 or more; merge its nodes"):
         load_mesh(written(2, nodes=4))
 

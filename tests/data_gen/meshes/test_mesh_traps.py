@@ -509,9 +509,10 @@ def test_faces_with_missing_vertices_are_refused_in_every_format(tmp_path):
     refusal(tmp_path / "a.off")
 
 
-def test_too_many_faces_are_decimated_where_the_appearance_is_kept(tmp_path):
+def test_too_many_faces_are_decimated_where_the_appearance_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr("data_gen.meshes.mesh.MAX_FACES", 2000)
     ball = trimesh.creation.icosphere(subdivisions=4)
-    mesh = prepare_scene(trimesh.Scene(ball.copy()), "ball", max_faces=2000)
+    mesh = prepare_scene(trimesh.Scene(ball.copy()), "ball")
     assert warning(mesh) == f"decimated from {len(ball.faces)} to {mesh.face_count} triangles"
     assert 1000 < mesh.face_count <= 2000
     part = mesh_parts(mesh)[0]
@@ -519,24 +520,26 @@ def test_too_many_faces_are_decimated_where_the_appearance_is_kept(tmp_path):
     assert np.isclose(outwards(part), 4 / 3 * np.pi, rtol=0.02)
 
     ball.visual.vertex_colors = np.where(ball.vertices[:, 2:] > 0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
-    part = only_part(prepare_scene(trimesh.Scene(ball), "ball", max_faces=2000))
+    part = only_part(prepare_scene(trimesh.Scene(ball), "ball"))
     red = part.visual.vertex_colors[:, 0] == 255
     assert (red == (part.vertices[:, 2] > 0))[np.abs(part.vertices[:, 2]) > 0.1].all()
     linear = ball.visual.vertex_colors / 255.0
     path = write_glb(tmp_path / "a.glb", positions=ball.vertices, faces=ball.faces, colours=linear)
-    part = only_part(load_mesh(path, max_faces=2000))
+    part = only_part(load_mesh(path))
     red = part.visual.vertex_attributes[LINEAR_COLOUR][:, 0] == 1
     assert (red == (part.vertices[:, 2] > 0))[np.abs(part.vertices[:, 2]) > 0.1].all()
 
 
-def test_meshes_that_cannot_be_decimated_are_drawn_up_to_a_limit_of_faces():
+def test_meshes_that_cannot_be_decimated_are_drawn_up_to_a_limit_of_faces(monkeypatch):
+    monkeypatch.setattr("data_gen.meshes.mesh.MAX_FACES", 1000)
     ball = trimesh.creation.icosphere(subdivisions=3)
     ball.visual.face_colors = np.random.default_rng(0).integers(0, 255, (len(ball.faces), 4), dtype=np.uint8)
-    mesh = prepare_scene(trimesh.Scene(ball), "ball", max_faces=1000)
+    mesh = prepare_scene(trimesh.Scene(ball), "ball")
     assert warning(mesh) == "1280 triangles drawn as they are: textures or face colours would not survive decimation"
     assert mesh.face_count == 1280
+    monkeypatch.setattr("data_gen.meshes.mesh.MAX_FACES", 100)
     with pytest.raises(MeshError, match="before decimation, found 1280"):
-        prepare_scene(trimesh.Scene(ball), "ball", max_faces=100)
+        prepare_scene(trimesh.Scene(ball), "ball")
 
 
 def test_a_quarter_of_a_million_faces_are_drawn_unchanged(tmp_path):

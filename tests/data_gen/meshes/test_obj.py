@@ -9,8 +9,8 @@ import trimesh
 from mesh_writers import OBJ_FACES, OBJ_SOLID, picture, write_obj
 
 from data_gen.meshes import model_folder
+from data_gen.meshes.formats.mtl import MAX_LIBRARIES
 from data_gen.meshes.mesh import MeshError, load_mesh, mesh_parts
-from data_gen.meshes.mtl import MAX_LIBRARIES
 
 PAINT = "newmtl paint\nKd 1 0 0\n"
 

@@ -5,10 +5,17 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
+import trimesh
 
 from data_gen.shapes.parts import Part
+from data_gen.shapes.solids import Solid
 
 _TINY = 1e-12
+
+
+def bare_mesh(solid: Solid) -> trimesh.Trimesh:
+    """The geometry as trimesh sees it, vertices as they are (no merging, no repair)."""
+    return trimesh.Trimesh(solid.vertices, solid.faces, process=False)
 
 
 def digest(scene: object) -> str:

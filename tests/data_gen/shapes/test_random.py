@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from solid_checks import bare_mesh
 
 from data_gen.shapes import assemble, make
 from data_gen.shapes.materials import plain
@@ -18,11 +19,11 @@ from data_gen.shapes.random.primitives import FRAMES, PRIMITIVES, primitive
 from data_gen.shapes.random.relief import displaced, vertex_normals
 from data_gen.shapes.random.structures import STRUCTURES
 from data_gen.shapes.random.textures import TEXTURES
-from data_gen.shapes.random.tubes import frames_along, moved, subdivided, tube
+from data_gen.shapes.random.tubes import frames_along, subdivided, tube
 
 
 def check_solid(solid, where):
-    mesh = solid.mesh()
+    mesh = bare_mesh(solid)
     assert np.isfinite(solid.vertices).all(), where
     assert mesh.is_watertight, where
     assert mesh.is_winding_consistent, where
@@ -87,7 +88,7 @@ def test_cuts_of_random_solids_stay_closed():
     for seed in range(12):
         rng = np.random.default_rng(seed)
         solid, tool = primitive(rng, 0.5), primitive(rng, 0.5)
-        left = difference(solid, moved(tool, 0.6 * np.eye(3), rng.uniform(-0.6, 0.6, 3)))
+        left = difference(solid, tool.transformed(0.6 * np.eye(3), rng.uniform(-0.6, 0.6, 3)))
         if left is not None:
             check_solid(left, seed)
             assert left.volume <= solid.volume * (1 + 1e-9)
@@ -174,7 +175,7 @@ def test_a_height_field_moves_along_the_normal():
 
 def test_a_reflected_solid_is_oriented_outwards():
     solid = next(iter(PRIMITIVES))(np.random.default_rng(0), True)
-    flipped = moved(solid, np.diag([1.0, -0.5, 1.0]), np.array([3.0, 0.0, 0.0]))
+    flipped = solid.transformed(np.diag([1.0, -0.5, 1.0]), np.array([3.0, 0.0, 0.0]))
     check_solid(flipped, "reflected")
     assert flipped.volume == pytest.approx(0.5 * solid.volume)
 

@@ -11,9 +11,9 @@ import trimesh
 from trimesh.visual import TextureVisuals
 
 from data_gen.meshes.files import MeshError
-from data_gen.meshes.gltf.accessors import as_numbers, read_accessor, read_numbers
-from data_gen.meshes.gltf.container import Document, not_negative
-from data_gen.meshes.gltf.materials import GltfMaterial, TextureCoordinates
+from data_gen.meshes.formats.gltf.accessors import as_numbers, read_accessor, read_numbers
+from data_gen.meshes.formats.gltf.container import Document, not_negative
+from data_gen.meshes.formats.gltf.materials import GltfMaterial, TextureCoordinates
 from data_gen.meshes.materials import EMISSIVE_UV, VERTEX_COLOUR, DrawnMaterial
 
 __all__ = ["Skinning", "read_primitive"]
@@ -32,8 +32,8 @@ def read_primitive(
     label: str,
     materials: Sequence[GltfMaterial],
     *,
-    weights: Sequence[float] = (),
-    skinning: Skinning | None = None,
+    weights: Sequence[float],
+    skinning: Skinning | None,
 ) -> trimesh.Trimesh | None:
     """Make a mesh of a primitive.
 
@@ -43,7 +43,7 @@ def read_primitive(
         label: its name in warnings.
         materials: the materials of the file.
         weights: of its morph targets; missing ones count as 0.
-        skinning: the matrices of its joints, which replace its node's transform.
+        skinning: the matrices of its joints, which replace its node's transform; None without a skin.
 
     Returns:
         The mesh, with `metadata["one_sided"]`; None, with a warning, for points and lines.
@@ -86,7 +86,7 @@ class _Attributes:
     """The arrays of a primitive, from its accessors or its compressed block."""
 
     def __init__(self, document: Document, primitive: dict[str, Any], label: str) -> None:
-        self._document, self._label = document, label
+        self.document, self.label = document, label
         self._accessors: dict[str, int] = primitive["attributes"]
         self._indices: int | None = primitive.get("indices")
         self._decoded: dict[str, npt.NDArray[Any]] = {}
@@ -96,7 +96,7 @@ class _Attributes:
             self._decoded, self._faces = _decompress(document, block, label)
 
     def _accessor(self, name: str) -> dict[str, Any]:
-        return self._document.items("accessors")[not_negative(self._accessors[name])]
+        return self.document.items("accessors")[not_negative(self._accessors[name])]
 
     def __contains__(self, name: str) -> bool:
         return name in self._accessors
@@ -104,27 +104,21 @@ class _Attributes:
     def raw(self, name: str) -> npt.NDArray[Any]:
         """Items of an attribute as stored in the file."""
         if name not in self._decoded:
-            return read_accessor(self._document, self._accessors[name])
+            return read_accessor(self.document, self._accessors[name])
         count = self._accessor(name)["count"]
         if len(self._decoded[name]) != count:
             raise MeshError(
-                f"{self._document.path}: {self._label}: expected {count} vertices, found {len(self._decoded[name])} "
+                f"{self.document.path}: {self.label}: expected {count} vertices, found {len(self._decoded[name])} "
                 "in its compressed data; export it again"
             )
         return self._decoded[name]
 
     def floats(self, name: str) -> npt.NDArray[Any]:
-        """Items of an attribute as numbers; float32 unchanged."""
+        """Items of an attribute as numbers, quantised ones decoded as glTF defines; float32 unchanged."""
         found = self.raw(name)
-        return found if found.dtype.kind == "f" else self.numbers(name)
-
-    def numbers(self, name: str) -> Floats:
-        """Items of an attribute as numbers, quantised ones decoded as glTF defines."""
-        return as_numbers(self.raw(name), normalised=bool(self._accessor(name).get("normalized")))
-
-    def warn(self, what: str) -> None:
-        """Add a warning about the primitive."""
-        self._document.warnings.append(f"{self._label}: {what}")
+        if found.dtype.kind == "f":
+            return found
+        return as_numbers(found, normalised=bool(self._accessor(name).get("normalized")))
 
     def corners(self, vertices: int) -> npt.NDArray[np.int64]:
         """Vertex indices in the order of the primitive."""
@@ -132,7 +126,7 @@ class _Attributes:
             return self._faces.reshape(-1).astype(np.int64)
         if self._indices is None:
             return np.arange(vertices, dtype=np.int64)
-        return read_accessor(self._document, self._indices).reshape(-1).astype(np.int64)
+        return read_accessor(self.document, self._indices).reshape(-1).astype(np.int64)
 
 
 def _decompress(
@@ -183,7 +177,7 @@ def _morph(
     for weight, target in zip(weights, primitive.get("targets", []), strict=False):
         for name, keyword in names.items():
             if weight and name in target and keyword in keywords:
-                shift = read_numbers(attributes._document, target[name])
+                shift = read_numbers(attributes.document, target[name])
                 if shift.shape != keywords[keyword].shape:
                     raise ValueError(f"a morph target of shape {shift.shape} for {keywords[keyword].shape}")
                 keywords[keyword] = keywords[keyword] + float(weight) * shift
@@ -195,7 +189,7 @@ def _skin(attributes: _Attributes, skinning: Skinning, keywords: dict[str, Any])
     number = 0
     while f"JOINTS_{number}" in attributes and f"WEIGHTS_{number}" in attributes:
         joints = attributes.raw(f"JOINTS_{number}").astype(np.int64)
-        weights = attributes.numbers(f"WEIGHTS_{number}")
+        weights = attributes.floats(f"WEIGHTS_{number}")
         for column in range(4):
             blended += weights[:, column, None, None] * skinning[joints[:, column]]
         number += 1
@@ -215,7 +209,8 @@ def _visual(attributes: _Attributes, material: GltfMaterial, colours: npt.NDArra
     if material.material.emissiveTexture is not None and material.emissive != material.base:
         uv = _uv(attributes, material.emissive)
         if uv is None:
-            attributes.warn("its emissiveTexture has no coordinates; those of its base colour taken")
+            what = "its emissiveTexture has no coordinates; those of its base colour taken"
+            attributes.document.warnings.append(f"{attributes.label}: {what}")
         else:
             visual.vertex_attributes[EMISSIVE_UV] = uv
     return visual

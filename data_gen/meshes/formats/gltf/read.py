@@ -15,10 +15,10 @@ import trimesh
 from trimesh.util import unique_name
 
 from data_gen.meshes.files import MAX_PARTS, MeshError
-from data_gen.meshes.gltf.accessors import check_accessors, read_numbers
-from data_gen.meshes.gltf.container import Document, not_negative, open_document
-from data_gen.meshes.gltf.materials import GltfMaterial, read_materials
-from data_gen.meshes.gltf.primitives import Skinning, read_primitive
+from data_gen.meshes.formats.gltf.accessors import check_accessors, read_numbers
+from data_gen.meshes.formats.gltf.container import Document, not_negative, open_document
+from data_gen.meshes.formats.gltf.materials import GltfMaterial, read_materials
+from data_gen.meshes.formats.gltf.primitives import Skinning, read_primitive
 from data_gen.meshes.materials import ColourSpace
 from data_gen.meshes.model_folder import ModelFolder
 

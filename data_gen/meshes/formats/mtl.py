@@ -14,7 +14,6 @@ of 255) becomes up to 143 instead of 97.
 
 from __future__ import annotations
 
-import codecs
 import io
 import re
 from typing import Any
@@ -22,12 +21,12 @@ from typing import Any
 import numpy as np
 import PIL.Image
 
-from data_gen.meshes.files import IMAGE_FORMATS, MAX_TEXT_BYTES, MeshError
+from data_gen.meshes.files import IMAGE_FORMATS, MAX_TEXT_BYTES, MeshError, decode_text
 from data_gen.meshes.materials import LinearMaterial, convert_image, roughness_of_exponent
 from data_gen.meshes.model_folder import ModelFolder, without_comment
 from hyperplanes.utilities.colour import linear_from_srgb
 
-__all__ = ["MAX_LIBRARIES", "MtlMaterial", "decode_text", "find_material", "read_materials"]
+__all__ = ["MAX_LIBRARIES", "MtlMaterial", "find_material", "read_materials"]
 
 MAX_LIBRARIES = 1000
 """Most different material libraries of an OBJ file."""
@@ -46,16 +45,6 @@ class MtlMaterial(LinearMaterial):
 
     scale: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
-
-
-def decode_text(data: bytes) -> str:
-    """Text of a file without declared encoding: UTF-16 with a byte order mark, UTF-8, else Latin-1."""
-    if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
-        return data.decode("utf-16", errors="replace")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
 
 
 def read_materials(libraries: list[str], folder: ModelFolder, warnings: list[str]) -> dict[str, MtlMaterial]:

@@ -16,7 +16,7 @@ import PIL.Image
 from trimesh.visual.gloss import specular_to_pbr
 
 from data_gen.meshes.files import IMAGE_FORMATS
-from data_gen.meshes.gltf.container import Document, not_negative, read_uri
+from data_gen.meshes.formats.gltf.container import Document, not_negative, read_uri
 from data_gen.meshes.materials import DEFAULT_COLOUR, DrawnMaterial, LinearMaterial, Wrap, convert_image
 from hyperplanes.utilities.colour import linear_from_srgb
 

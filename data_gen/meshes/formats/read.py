@@ -9,13 +9,15 @@ from collections.abc import Generator
 
 import trimesh
 
-from data_gen.meshes.dae import read_dae
 from data_gen.meshes.files import MeshError
-from data_gen.meshes.formats import read_off, read_ply, read_stl
-from data_gen.meshes.gltf import read_gltf
+from data_gen.meshes.formats.dae import read_dae
+from data_gen.meshes.formats.gltf import read_gltf
+from data_gen.meshes.formats.obj import read_obj
+from data_gen.meshes.formats.off import read_off
+from data_gen.meshes.formats.ply import read_ply
+from data_gen.meshes.formats.stl import read_stl
 from data_gen.meshes.materials import ColourSpace
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.obj import read_obj
 
 __all__ = ["read_scene"]
 

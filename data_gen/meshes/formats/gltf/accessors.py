@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from data_gen.meshes.files import MeshError
-from data_gen.meshes.gltf.container import Document, not_negative
+from data_gen.meshes.formats.gltf.container import Document, not_negative
 
 __all__ = ["as_numbers", "check_accessors", "read_accessor", "read_numbers"]
 

@@ -7,12 +7,11 @@ import binascii
 import json
 import struct
 import urllib.parse
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-from data_gen.meshes.files import MeshError
+from data_gen.meshes.files import MeshError, decode_text
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.mtl import decode_text
 
 __all__ = ["Document", "not_negative", "open_document", "read_uri"]
 
@@ -51,7 +50,7 @@ class Document:
     header: dict[str, Any]
     buffers: list[bytes]
     folder: ModelFolder
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str]
 
     @property
     def path(self) -> Any:

@@ -19,10 +19,10 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from data_gen.meshes.files import MeshError
+from data_gen.meshes.files import UNFINISHED, MeshError, decode_text
+from data_gen.meshes.formats.mtl import MtlMaterial, find_material, read_materials
 from data_gen.meshes.materials import DEFAULT_COLOUR
 from data_gen.meshes.model_folder import ModelFolder
-from data_gen.meshes.mtl import MtlMaterial, decode_text, find_material, read_materials
 from data_gen.meshes.triangulate import TOO_FEW_CORNERS, retriangulate
 
 __all__ = ["read_obj"]
@@ -111,7 +111,7 @@ def read_obj(data: bytes, folder: ModelFolder) -> tuple[trimesh.Scene, list[str]
         )
     warnings += [f"{count} {what}" for what, count in skipped.items()]
     if text and not text.endswith("\n"):
-        warnings.append("the last line does not end: the file may have been cut")
+        warnings.append(UNFINISHED)
     tables = {key: _table(rows[key], numbers[key], key, folder) for key in rows}
     _check_indices(groups, tables, elsewhere, folder, warnings)
     white = _white(tables["v"])

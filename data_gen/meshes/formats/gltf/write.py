@@ -16,7 +16,7 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from data_gen.meshes.gltf.materials import WRAPS
+from data_gen.meshes.formats.gltf.materials import WRAPS
 from data_gen.meshes.materials import (
     EMISSIVE_UV,
     LINEAR_COLOUR,
