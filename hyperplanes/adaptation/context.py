@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import interpolate
 from torch.nn.utils.rnn import pad_sequence
 
 from hyperplanes.geometry import cameras as camera
@@ -71,7 +72,7 @@ def observe(contexts: Sequence[SupportContext], resolution: int = 0) -> Observed
     read = [each.views[each.hyperplanes] for each in contexts]
     directions = [camera.viewing_directions(each.cameras) for each in read]
     size = (resolution, resolution) if resolution else read[0].size
-    images = [_resized(each.images, size) for each in read]
+    images = [each.images if each.size == size else interpolate(each.images, size, mode="area") for each in read]
     # objects with fewer HyperPlanes are padded with zeros, which are marked in `present`
     present = [torch.ones(len(each), dtype=torch.bool, device=each.device) for each in directions]
     return Observed(*(pad_sequence(part, batch_first=True) for part in (images, directions, present)))
@@ -95,8 +96,3 @@ def trained_on(context: SupportContext, support: Views) -> Views:
 def live_pixels(occupancy: Occupancy, views: Views) -> Int[Tensor, " pixel"]:
     """Flat indices (view, row, column) of the pixels whose rays meet an occupied voxel."""
     return footprint(occupancy, views.cameras).flatten().nonzero()[:, 0]
-
-
-def _resized(images: Float[Tensor, "view 3 height width"], size: tuple[int, int]) -> Tensor:
-    """Images resized to `size`, by averaging areas."""
-    return images if images.shape[2:] == size else torch.nn.functional.interpolate(images, size, mode="area")
