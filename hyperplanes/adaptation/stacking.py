@@ -195,7 +195,8 @@ def stack(
     overruled = share > OVERRULED
     shown, other = (hull, learned) if overruled else (learned, hull)
     share = 1 - share if overruled else share
-    own = attributes_of(shown) | {"symmetry": learned.symmetry}  # of the object; the hull has none
+    own = attributes_of(shown)
+    own["symmetry"] = learned.symmetry  # of the object; the hull has none
     return StackedField(**own, other=other, share=share, overruled=overruled, gate=gate, views=views)
 
 
