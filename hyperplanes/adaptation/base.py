@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -25,16 +25,15 @@ from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.rendering.images import Pictures
 from hyperplanes.rendering.refinement import RefinedOccupancy, refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
-from hyperplanes.rendering.scene import mapped
+from hyperplanes.rendering.scene import dtype_of, is_thread_safe, mapped
 from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.kept import kept
 from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views
 
-__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "hull"]
+__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "attributes_of", "hull"]
 
-OPACITY_LOSS = 0.05  # of a ray along which all dropped voxels would lie; with 0.3 haze of young fields is lost
-MARGIN_LOSS = 0.9  # the same for voxels around those that have density: 2.4 % in one
+MARGIN_LOSS = 0.9  # `margin_loss` of `refine`: 2.4 % in one voxel
 POINTS = 1 << 12  # per thread, for densities
 
 
@@ -106,13 +105,13 @@ class AdaptedField:
 
     @property
     def dtype(self) -> torch.dtype:
-        """The dtype in which the field expects points; float32 for functions without an attribute `dtype`."""
-        return getattr(self.field, "dtype", torch.float32)
+        """The dtype in which the field expects points."""
+        return dtype_of(self.field)
 
     @property
     def thread_safe(self) -> bool:
-        """Whether several threads may evaluate the field at once; its attribute `thread_safe`."""
-        return getattr(self.field, "thread_safe", False)
+        """Whether several threads may evaluate the field at once."""
+        return is_thread_safe(self.field)
 
     @property
     def refined_occupancy(self) -> RefinedOccupancy:
@@ -123,10 +122,8 @@ class AdaptedField:
         if self.refined is not None:
             return self.refined
         weights = self.field.parameters.values() if isinstance(self.field, Field) else ()
-        return kept(self, "refined", [self.occupancy.occupied, *weights], self._refined)
-
-    def _refined(self) -> RefinedOccupancy:
-        return refine(self.occupancy, self.density, opacity_loss=OPACITY_LOSS, margin_loss=MARGIN_LOSS)
+        make = partial(refine, self.occupancy, self.density, margin_loss=MARGIN_LOSS)
+        return kept(self, "refined", [self.occupancy.occupied, *weights], make)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without evaluating colour if the field can do that."""
@@ -183,6 +180,12 @@ class AdaptedField:
         Returns:
             One picture a camera, on the device of the field.
         """
+        return self._pictures(cameras, sampling, antialias, mixed_precision)
+
+    def _pictures(
+        self, cameras: PinholeCamera, sampling: Sampler | None, antialias: bool | None, mixed_precision: bool
+    ) -> Pictures:
+        """As `render`, which fields made of other fields define by this."""
         sampling = sampling or self.sampling.for_rendering(pixels_across(cameras, self.occupancy.bounds))
         return render(
             self._for_pictures(self.field, mixed_precision),
@@ -200,6 +203,11 @@ class AdaptedField:
             cast = partial(torch.Tensor.to, dtype=self.dtype)
             return mapped(field, cast, cast, torch.Tensor.float)
         return field.in_mixed_precision if mixed_precision and isinstance(field, Field) else field
+
+
+def attributes_of(adapted: AdaptedField) -> dict[str, Any]:
+    """The attributes of a field by name, for another one that is made of it."""
+    return {each.name: getattr(adapted, each.name) for each in fields(AdaptedField)}
 
 
 def hull(support: Views, side: int, within: Occupancy | None = None) -> Occupancy:

@@ -8,23 +8,19 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import interpolate
 from torch.nn.utils.rnn import pad_sequence
 
-from hyperplanes.adaptation.base import hull
-from hyperplanes.adaptation.reflections import handicaps, with_reflections
-from hyperplanes.fields import Target
-from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
-from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.reflections import Symmetry
 from hyperplanes.geometry.visibility import VisibilityPlanes
-from hyperplanes.hypernetwork import HyperNetwork, Observed
+from hyperplanes.hypernetwork import Observed
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views
 
-__all__ = ["SupportContext", "arrange", "live_pixels", "observe", "prepare_context", "trained_on"]
-
+__all__ = ["SupportContext", "live_pixels", "observe", "trained_on"]
 
 MOST_REFLECTED = 15  # given views up to which gradient steps also take rays of their reflections
 
@@ -64,69 +60,6 @@ class SupportContext:
         return self if self.planes is None else replace(self, planes=self.planes.mask_views(views))
 
 
-def arrange(support: Views, target: Target, rig: Rig) -> Views:
-    """The support views as a field takes them.
-
-    Raises:
-        ValueError: no view, or a rig that has not been set.
-    """
-    if not len(support):
-        raise ValueError("support: expected at least one view, got none")
-    return target.arrange(support, rig)
-
-
-def prepare_context(
-    support: Views,
-    target: Target,
-    rig: Rig,
-    hypernetwork: HyperNetwork | None,
-    hull_resolution: int,
-    *,
-    carved: bool = True,
-    masks_repeated: bool = False,
-    symmetry: Symmetry | None = None,
-) -> SupportContext:
-    """The support context of one object.
-
-    Args:
-        support: the views, where the weights are.
-        target: the network that looks colours up in them.
-        rig: camera directions of its planes.
-        hypernetwork: if there is one.
-        hull_resolution: voxels an axis of the visual hull, at least.
-        carved: if False, a single occupied voxel replaces the hull. For a hypernetwork that reads the hull it is carved
-            in any case.
-        masks_repeated: if there are fewer views than planes, show each view at one plane and mask the others.
-        symmetry: of the object, whose views are then followed by their reflections.
-    """
-    given, support = len(support), with_reflections(support, symmetry)
-    views, device = arrange(support, target, rig), support.images.device
-
-    # the visual hull of all views, not only of those that become planes
-    reads_volume = hypernetwork is not None and hypernetwork.reads_volume
-    if carved or reads_volume:
-        occupancy = hull(support, target.hull_resolution(hull_resolution, support))
-    else:
-        occupancy = full(support.bounds, 1, device)
-
-    # what the field looks colours up in
-    planes = target.planes_of(views, occupancy)
-    if isinstance(planes, VisibilityPlanes) and symmetry is not None:
-        planes = planes.with_handicaps(handicaps(given, symmetry))
-    if masks_repeated and len(support) < len(views):
-        planes = planes.mask_views(rig.repeated(support).to(device))
-
-    # what the hypernetwork reads: a volume of all views, or images of some of them
-    if reads_volume:
-        return SupportContext(
-            views, planes, occupancy, torch.arange(len(views), device=device), target.volume_of(planes), symmetry
-        )
-    chosen = torch.arange(0, device=device)
-    if hypernetwork is not None:
-        chosen = target.choose_hyperplanes(views, rig, hypernetwork.views, hypernetwork.choice)
-    return SupportContext(views, planes, occupancy, chosen, symmetry=symmetry)
-
-
 def observe(contexts: Sequence[SupportContext], resolution: int = 0) -> Observed:
     """The inputs of a hypernetwork for a batch of objects (HyperPlanes, Eq. 7: I_1..I_k and d_1..d_k).
 
@@ -139,7 +72,7 @@ def observe(contexts: Sequence[SupportContext], resolution: int = 0) -> Observed
     read = [each.views[each.hyperplanes] for each in contexts]
     directions = [camera.viewing_directions(each.cameras) for each in read]
     size = (resolution, resolution) if resolution else read[0].size
-    images = [_resized(each.images, size) for each in read]
+    images = [each.images if each.size == size else interpolate(each.images, size, mode="area") for each in read]
     # objects with fewer HyperPlanes are padded with zeros, which are marked in `present`
     present = [torch.ones(len(each), dtype=torch.bool, device=each.device) for each in directions]
     return Observed(*(pad_sequence(part, batch_first=True) for part in (images, directions, present)))
@@ -163,8 +96,3 @@ def trained_on(context: SupportContext, support: Views) -> Views:
 def live_pixels(occupancy: Occupancy, views: Views) -> Int[Tensor, " pixel"]:
     """Flat indices (view, row, column) of the pixels whose rays meet an occupied voxel."""
     return footprint(occupancy, views.cameras).flatten().nonzero()[:, 0]
-
-
-def _resized(images: Float[Tensor, "view 3 height width"], size: tuple[int, int]) -> Tensor:
-    """Images resized to `size`, by averaging areas."""
-    return images if images.shape[2:] == size else torch.nn.functional.interpolate(images, size, mode="area")

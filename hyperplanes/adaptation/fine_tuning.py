@@ -30,7 +30,6 @@ __all__ = [
     "fine_tune_to",
     "made_anyway",
     "make_descent",
-    "one_step",
 ]
 
 Made = TypeVar("Made")
@@ -126,19 +125,6 @@ def _fine_tune_in_frame(
         error.field = None if error.field is None else placed.in_scene(error.field)
         raise
     return placed.in_scene(tuned)
-
-
-@torch.no_grad()
-def one_step(network: HyperPlanesNetwork, support: Views) -> AdaptedField:
-    """As `HyperPlanes.adapt`.
-
-    Args:
-        network: the model.
-        support: the views of the object.
-    """
-    placed = to_canonical_frame(network, support)
-    context = placed.context(network)
-    return placed.in_scene(stacked_field(network, context, updated_weights(network, context)))
 
 
 def fine_tune_to(

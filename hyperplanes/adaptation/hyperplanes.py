@@ -10,10 +10,11 @@ from typing import Self
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.checkpoints import read_checkpoint, write_checkpoint
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.finding_symmetry import find_symmetry
-from hyperplanes.adaptation.fine_tuning import fine_tune, one_step
+from hyperplanes.adaptation.fine_tuning import fine_tune
 from hyperplanes.adaptation.hub import upload_checkpoint
 from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
@@ -68,7 +69,10 @@ class HyperPlanes(HyperPlanesNetwork):
         `config.stacked`, pictures are averaged with those of the visual hull (`adaptation.stacking`). With
         `config.residuals`, pictures are corrected by the residuals of the support views (`adaptation.residuals`).
         """
-        return corrected_field(self, one_step(self, support), support)
+        placed = to_canonical_frame(self, support)
+        context = placed.context(self)
+        adapted = stacked_field(self, context, updated_weights(self, context))
+        return corrected_field(self, placed.in_scene(adapted), support)
 
     @checked
     @without_autocast

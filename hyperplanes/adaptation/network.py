@@ -10,15 +10,17 @@ from threading import Lock
 import torch
 from torch import Tensor, nn
 
-from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.context import SupportContext, arrange, live_pixels, observe, prepare_context
+from hyperplanes.adaptation.base import AdaptedField, hull
+from hyperplanes.adaptation.context import SupportContext, live_pixels, observe
 from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.reflections import UNKNOWN
+from hyperplanes.adaptation.reflections import UNKNOWN, handicaps, with_reflections
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
 from hyperplanes.fields.rig import Rig
+from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.reflections import Symmetry
+from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.hypernetwork import HyperNetwork, LearnedStep
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
@@ -110,9 +112,13 @@ class HyperPlanesNetwork(nn.Module):
 
         Of more views than planes, the best matches are taken, each once. Of fewer, some views become several planes.
         With order "file" the views keep their order: the first ones, repeated from the first if they are too few.
-        Raises ValueError without views, or if the rig was never set.
+
+        Raises:
+            ValueError: no view, or a rig that has not been set.
         """
-        return arrange(support, self.target, self.known_rig)
+        if not len(support):
+            raise ValueError("support: expected at least one view, got none")
+        return self.target.arrange(support, self.known_rig)
 
     @checked
     def prepare(self, support: Views, *, carved: bool = True, symmetry: Symmetry | None = None) -> SupportContext:
@@ -129,16 +135,30 @@ class HyperPlanesNetwork(nn.Module):
         """
         if symmetry is not None and not self.target.permutation_invariant:
             raise ValueError(f"symmetry: expected None for {self.config.target}, which takes a fixed number of views")
-        return prepare_context(
-            self.to_own(support),
-            self.target,
-            self.known_rig,
-            self.hypernetwork,
-            self.config.hull_resolution,
-            carved=carved,
-            masks_repeated=self.config.plane_dropout > 0,
-            symmetry=symmetry,
-        )
+        given, support = len(support), with_reflections(self.to_own(support), symmetry)
+        views, device = self.arrange(support), self.rig.device
+
+        # the visual hull of all views, not only of those that become planes
+        if carved or self.reads_volume:
+            occupancy = hull(support, self.target.hull_resolution(self.config.hull_resolution, support))
+        else:
+            occupancy = full(support.bounds, 1, device)
+
+        # what the field looks colours up in; with fewer views than planes, each view is shown at one plane, if planes
+        # were masked in training
+        planes = self.target.planes_of(views, occupancy)
+        if isinstance(planes, VisibilityPlanes) and symmetry is not None:
+            planes = planes.with_handicaps(handicaps(given, symmetry))
+        if self.config.plane_dropout and len(support) < len(views):
+            planes = planes.mask_views(self.known_rig.repeated(support).to(device))
+
+        # what the hypernetwork reads: a volume of all views, or images of some of them
+        volume, chosen = None, torch.arange(0, device=device)
+        if self.reads_volume:
+            volume, chosen = self.target.volume_of(planes), torch.arange(len(views), device=device)
+        elif (reader := self.hypernetwork) is not None:
+            chosen = self.target.choose_hyperplanes(views, self.known_rig, reader.views, reader.choice)
+        return SupportContext(views, planes, occupancy, chosen, volume, symmetry)
 
     def to_own(self, support: Views) -> Views:
         """The views with the device and dtype of the weights; ValueError for weights of less than single precision."""

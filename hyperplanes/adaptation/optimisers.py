@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import torch
@@ -57,12 +57,8 @@ class Muon(Optimizer):
             raise ValueError("parameters: expected matrices, got a tensor of another number of dimensions")
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def step(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """One step along the orthogonalised momentum."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
         for group in self.param_groups:
             moved = [value for value in group["params"] if value.grad is not None]
             for value in moved:
@@ -73,7 +69,6 @@ class Muon(Optimizer):
             ahead = [value.grad.lerp(self.state[value]["momentum"], group["momentum"]) for value in moved]
             for value, direction in zip(moved, run(orthogonalise, ahead), strict=True):
                 value.add_(direction, alpha=-group["lr"] * max(1, value.shape[0] / value.shape[1]) ** 0.5)
-        return loss
 
 
 def make_optimisers(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from threading import RLock
 
 import torch
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable
+from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable, attributes_of
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry import cameras as camera
@@ -199,15 +199,9 @@ class CorrectedField(AdaptedField):
         """As `AdaptedField.trace`, without correction."""
         return self.uncorrected.trace(rays, generator, differentiable=differentiable)
 
-    def render(
-        self,
-        cameras: PinholeCamera,
-        sampling: Sampler | None = None,
-        antialias: bool | None = None,
-        *,
-        mixed_precision: bool = True,
+    def _pictures(
+        self, cameras: PinholeCamera, sampling: Sampler | None, antialias: bool | None, mixed_precision: bool
     ) -> Pictures:
-        """As `AdaptedField.render`, corrected if neither `sampling` nor `antialias` is given."""
         pictures = self.uncorrected.render(cameras, sampling, antialias, mixed_precision=mixed_precision)
         if sampling is not None or antialias is not None:
             return pictures
@@ -241,5 +235,5 @@ def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support:
     """
     if not are_corrected(network, support):
         return adapted
-    own = {each.name: getattr(adapted, each.name) for each in fields(AdaptedField)}
-    return CorrectedField(**own, uncorrected=adapted, residuals=ResidualField(adapted, network.to_own(support)))
+    residuals = ResidualField(adapted, network.to_own(support))
+    return CorrectedField(**attributes_of(adapted), uncorrected=adapted, residuals=residuals)

@@ -18,7 +18,6 @@ from hyperplanes.geometry.reflections import Symmetry, rotation_about
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.renderer import Sampler
 from hyperplanes.rendering.scene import mapped
-from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.precision import without_autocast
 from hyperplanes.views import Views, moved
 
@@ -108,18 +107,9 @@ class RotatedField(AdaptedField):
         rays = replace(rays, origins=origins, directions=directions)
         return self.unrotated.trace(rays, generator, differentiable=differentiable)
 
-    @checked
-    @without_autocast
-    @torch.no_grad()
-    def render(
-        self,
-        cameras: PinholeCamera,
-        sampling: Sampler | None = None,
-        antialias: bool | None = None,
-        *,
-        mixed_precision: bool = True,
+    def _pictures(
+        self, cameras: PinholeCamera, sampling: Sampler | None, antialias: bool | None, mixed_precision: bool
     ) -> Pictures:
-        """As `AdaptedField.render`."""
         cameras = camera.moved(cameras, self._back)
         return self.unrotated.render(cameras, sampling, antialias, mixed_precision=mixed_precision)
 

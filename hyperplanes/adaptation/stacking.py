@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
 
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.adaptation.base import AdaptedField, Pictures
+from hyperplanes.adaptation.base import AdaptedField, Pictures, attributes_of
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.held_out import FEWEST, Trial, hold_out
@@ -26,7 +26,6 @@ from hyperplanes.geometry.visibility import VisibilityPlanes
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.renderer import Sampler
-from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.precision import without_autocast
 
 __all__ = [
@@ -88,20 +87,11 @@ class StackedField(AdaptedField):
             return own
         return self._mean(own, self.other.trace(rays, generator, differentiable=differentiable))
 
-    @checked
-    @without_autocast
-    @torch.no_grad()
-    def render(
-        self,
-        cameras: PinholeCamera,
-        sampling: Sampler | None = None,
-        antialias: bool | None = None,
-        *,
-        mixed_precision: bool = True,
+    def _pictures(
+        self, cameras: PinholeCamera, sampling: Sampler | None, antialias: bool | None, mixed_precision: bool
     ) -> Pictures:
-        """As `AdaptedField.render`, averaged over both fields; the visual hull keeps its own sampler."""
         of_own, of_other = self._samplers(sampling)
-        own = partial(super().render, cameras, of_own, antialias, mixed_precision=mixed_precision)
+        own = partial(super()._pictures, cameras, of_own, antialias, mixed_precision)
         if not self.share and self.gate is None:
             return own()
         other = partial(self.other.render, cameras, of_other, antialias, mixed_precision=mixed_precision)
@@ -205,7 +195,7 @@ def stack(
     overruled = share > OVERRULED
     shown, other = (hull, learned) if overruled else (learned, hull)
     share = 1 - share if overruled else share
-    own = {each.name: getattr(shown, each.name) for each in fields(shown)}
+    own = attributes_of(shown)
     own["symmetry"] = learned.symmetry  # of the object; the hull has none
     return StackedField(**own, other=other, share=share, overruled=overruled, gate=gate, views=views)
 
@@ -221,8 +211,7 @@ def average(tuned: AdaptedField, before: AdaptedField, share: float) -> AdaptedF
         before: the field before the steps.
         share: of `before`.
     """
-    own = {each.name: getattr(tuned, each.name) for each in fields(tuned)}
-    return AveragedField(**own, other=before, share=share)
+    return AveragedField(**attributes_of(tuned), other=before, share=share)
 
 
 @torch.no_grad()

@@ -30,6 +30,7 @@ from hyperplanes.utilities.arguments import checked
 __all__ = ["BakedScene", "bake", "coarsening", "default_side"]
 
 CHUNK = 1 << 12
+DIRECTIONS = 12  # from which colour is evaluated; at least one a harmonic
 SIDE = 128  # voxels an axis of the grid of transmittances
 MIN_TRANSMITTANCE = 0.02  # voxels that no viewing direction reaches with more than this are left out
 MIN_OPACITY = 0.005  # over 1/128 of the scene's diameter; voxels below it are left out
@@ -96,13 +97,7 @@ class BakedScene:
 
 @checked
 @torch.no_grad()
-def bake(
-    adapted: AdaptedField,
-    *,
-    side: int = 256,
-    directions: int = 12,
-    on_part: Callable[[int, int], None] | None = None,
-) -> BakedField:
+def bake(adapted: AdaptedField, *, side: int = 256, on_part: Callable[[int, int], None] | None = None) -> BakedField:
     """Density and view-dependent colour of a field, at the voxels that are visible from outside.
 
     Colour is fitted by least squares over a sphere of viewing directions, each weighted by the transmittance from
@@ -111,19 +106,16 @@ def bake(
     Args:
         adapted: the field of one object.
         side: voxels an axis; two for each pixel of the object's width lose little quality.
-        directions: viewing directions at which colour is evaluated.
         on_part: called with the numbers of voxels done and in total.
 
     Returns:
         The voxels, on the CPU.
 
     Raises:
-        ValueError: fewer directions than harmonics, or a field that is empty everywhere.
+        ValueError: a field that is empty everywhere.
     """
-    if directions < HARMONICS:
-        raise ValueError(f"directions: expected at least {HARMONICS}, one a harmonic, got {directions}")
     coarser = coarsening(side)
-    view = camera.fibonacci_sphere(directions, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
+    view = camera.fibonacci_sphere(DIRECTIONS, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
     # transmittance from outside to coarse voxels, along every direction
     coarse = _in_sphere(_resampled(adapted.refined_occupancy, side // coarser))
     optical_depth = torch.zeros_like(coarse.occupied, dtype=view.dtype)

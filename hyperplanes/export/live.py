@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -17,6 +16,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import quaternion_to_rotation_matrix, rotation_matrix_to_quaternion
 from torch import Tensor
 
+from hyperplanes.adaptation.base import Renderable
 from hyperplanes.export.images import orbit_cameras, to_pixels, upward
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.images import Pictures
@@ -34,14 +34,6 @@ SMALLEST, LARGEST = 48, 1024  # pixels of height
 WIDEST = 4096  # pixels of width
 THUMBNAIL = 128  # pixels of a photograph in its frustum
 ALONE = "nothing"  # the default choice for what is shown beside the field
-
-
-class Shown(Protocol):
-    """Anything that renders new views."""
-
-    def render(self, cameras: PinholeCamera) -> Pictures:
-        """The pictures of the cameras."""
-        ...
 
 
 @dataclass
@@ -136,8 +128,8 @@ class LiveViewer:
         require_viewer()
         import viser
 
-        self._shown: Shown | None = None
-        self._others: dict[str, Shown | None] = {}
+        self._shown: Renderable | None = None
+        self._others: dict[str, Renderable | None] = {}
         self._notes: dict[str, str] = {}  # of the other methods
         self._chosen = ALONE
         self._changed, self._stopped = threading.Condition(), False
@@ -170,7 +162,7 @@ class LiveViewer:
         """The address of the page."""
         return f"http://127.0.0.1:{self._server.get_port()}"
 
-    def show(self, shown: Shown, note: str) -> None:
+    def show(self, shown: Renderable, note: str) -> None:
         """Show another field, or the same one after it changed.
 
         Args:
@@ -181,7 +173,7 @@ class LiveViewer:
             self._shown, self._text = shown, note
             self._draw_anew()
 
-    def show_other(self, name: str, shown: Shown | None, note: str = "") -> None:
+    def show_other(self, name: str, shown: Renderable | None, note: str = "") -> None:
         """Set the field that another method makes of the same views.
 
         Args:
@@ -306,7 +298,7 @@ class LiveViewer:
                 # not again until the camera moves or the field changes
                 visit.finished = visit.finished or (not drawn and visit.moved == moved)
 
-    def _draw_for(self, client: object, shown: Shown, other: Shown | None, still: bool) -> bool:
+    def _draw_for(self, client: object, shown: Renderable, other: Renderable | None, still: bool) -> bool:
         """Render one picture for one visitor; False if the visitor's page has no size.
 
         Args:

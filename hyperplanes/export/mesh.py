@@ -14,6 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.geometry.rays import Rays
+from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.colour import linear_from_srgb
 from hyperplanes.utilities.files import format_of
 from hyperplanes.utilities.memory import require_memory
@@ -21,7 +23,6 @@ from hyperplanes.utilities.writing import write_whole
 
 if TYPE_CHECKING:
     import trimesh
-from hyperplanes.utilities.arguments import checked
 
 __all__ = [
     "MESH_FORMATS",
@@ -29,12 +30,12 @@ __all__ = [
     "as_trimesh",
     "check_voxels",
     "density_grid",
+    "distances_to",
     "extract_mesh",
     "save_mesh",
 ]
 
 MESH_FORMATS = ("ply", "glb", "obj")
-
 
 BYTES_OF_POINT = 64  # of the grid, while its density is computed
 
@@ -141,6 +142,20 @@ def as_trimesh(vertices: npt.NDArray[np.float32], faces: npt.NDArray[np.int64]) 
     import trimesh
 
     return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def distances_to(mesh: trimesh.Trimesh, rays: Rays) -> Float[Tensor, " ray"]:
+    """The distance along each ray at which it first meets a mesh; infinite where it does not.
+
+    Args:
+        mesh: in the world.
+        rays: on the CPU.
+    """
+    origins, directions = rays.origins.numpy(), rays.directions.numpy()
+    places, ray, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    distances = np.full(len(rays), np.inf, np.float32)
+    distances[ray] = np.linalg.norm(places - origins[ray], axis=1)
+    return torch.from_numpy(distances)
 
 
 def _colours(field: AdaptedField, mesh: trimesh.Trimesh, device: torch.device) -> npt.NDArray[np.float32]:

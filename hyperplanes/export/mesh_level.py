@@ -14,9 +14,9 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.export.mesh import Surface, as_trimesh
+from hyperplanes.export.mesh import Surface, as_trimesh, distances_to
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
+from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 
 __all__ = ["Agreement", "agreement", "choose_level"]
 
@@ -89,13 +89,8 @@ def agreement(surface: Surface, field: AdaptedField, cameras: PinholeCamera) -> 
     """
     small = _small_cameras(cameras, cameras.batch_size)
     wanted, depth = _rendered(field, small)
-    origins, directions = (part.reshape(-1, 3).numpy() for part in _pixel_rays(small))
-    rays = as_trimesh(surface.vertices, surface.faces).ray
-    places, ray, _ = rays.intersects_location(origins, directions, multiple_hits=False)
-    first = torch.full((wanted.numel(),), math.inf)
-    distances = np.linalg.norm(places - origins[ray], axis=1)
-    first[torch.from_numpy(ray)] = torch.from_numpy(distances).float()
-    first = first.reshape(wanted.shape)
+    mesh = as_trimesh(surface.vertices, surface.faces)
+    first = torch.stack([distances_to(mesh, rays) for rays in _pixel_rays(small)])
     both, union = first.isfinite() & wanted, (first.isfinite() | wanted).sum(1)
     overlap = torch.where(union > 0, both.sum(1) / union.clamp_min(1), 1.0).mean()
     near = (first - depth)[both].abs() <= DEPTH_TOLERANCE * field.occupancy.bounds.radius
@@ -111,13 +106,10 @@ def _small_cameras(cameras: PinholeCamera, most: int) -> PinholeCamera:
     return camera.resized(cameras, max(1, round(height * scale)), max(1, round(width * scale)))
 
 
-def _pixel_rays(cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Origins and directions (view, pixel, 3) of the rays through all pixels."""
+def _pixel_rays(cameras: PinholeCamera) -> list[Rays]:
+    """The rays through all pixels of each view."""
     pixels = pixel_grid(*camera.image_size(cameras))
-    rays = [
-        cast(cameras, torch.full((len(pixels),), view, dtype=torch.long), pixels) for view in range(cameras.batch_size)
-    ]
-    return torch.stack([each.origins for each in rays]), torch.stack([each.directions for each in rays])
+    return [cast(cameras, torch.full((len(pixels),), view), pixels) for view in range(cameras.batch_size)]
 
 
 def _rendered(field: AdaptedField, cameras: PinholeCamera) -> tuple[Tensor, Tensor]:
@@ -136,13 +128,11 @@ def _first_crossings(
     Yields:
         For each view, distances along the rays, infinite where the level is never exceeded.
     """
-    origins, directions = (part.to(density.device) for part in _pixel_rays(cameras))
-    start = bounds.normalise(origins)
-    middle = -(start * directions).sum(-1, keepdim=True)
     along = torch.linspace(-(3**0.5), 3**0.5, 2 * len(density), device=density.device)
-    for view in range(len(origins)):
-        distance = middle[view] + along
-        points = start[view, :, None] + distance[..., None] * directions[view, :, None]
+    for rays in _pixel_rays(cameras):
+        start, directions = (part.to(density.device) for part in (bounds.normalise(rays.origins), rays.directions))
+        distance = along - (start * directions).sum(-1, keepdim=True)
+        points = start[:, None] + distance[..., None] * directions[:, None]
         values = grid_sample(density[None, None], points.flip(-1)[None, None], align_corners=True)[0, 0, 0]
         wanted = levels.to(values).expand(len(values), -1).contiguous()
         index = torch.searchsorted(values.cummax(-1).values, wanted, right=True)

@@ -10,6 +10,7 @@ import zlib
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
@@ -169,7 +170,7 @@ def _encoded(baked: BakedField, bits: tuple[int, int, int]) -> tuple[list[float]
     """
     filled = baked.index.flatten() >= 0
     order = baked.index.flatten()[filled].long()
-    packed = (filled.reshape(-1, 8) * 2 ** torch.arange(8)).sum(1).byte()
+    packed = np.packbits(filled.numpy(), bitorder="little").tobytes()
     voxel = 2 * baked.bounds.radius / baked.side
     halves = (baked.values[order, 0] * voxel).clamp(0, 100).half().view(torch.int16).int()
     depth = torch.stack([halves >> 8 & 255, halves & 255]).byte()
@@ -181,7 +182,7 @@ def _encoded(baked: BakedField, bits: tuple[int, int, int]) -> tuple[list[float]
     low, span = torch.where(orders > 0, low, 0.0), torch.where(orders > 0, span, 0.0)
     scaled = ((values - low) / span.clamp_min(1e-6)).clamp(0, 1)
     coefficients = ((scaled * levels).round() / levels * 255).round().byte().T * (orders > 0)[:, None]
-    content = b"".join(part.contiguous().numpy().tobytes() for part in (packed, depth, coefficients))
+    content = packed + b"".join(part.contiguous().numpy().tobytes() for part in (depth, coefficients))
     return low.tolist(), span.tolist(), base64.b64encode(zlib.compress(content, 9)).decode()
 
 

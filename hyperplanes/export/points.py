@@ -75,7 +75,7 @@ def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, coun
     points, normals = surface.points[opaque], surface.normals[opaque]
     colours = pictures.images.permute(0, 2, 3, 1)[opaque].clamp(0, 1)
     values = torch.cat([points, normals, colours], 1).cpu()
-    values = _averaged(values, values[:, :3], bounds, count)
+    values = _averaged(values, bounds, count)
     found = PointCloud(values[:, :3], torch.nn.functional.normalize(values[:, 3:6], dim=-1), values[:, 6:])
     kept = _is_confirmed(found.points, surface.z.cpu(), camera.to(cameras, "cpu", torch.float32), bounds)
     if not kept.any():
@@ -83,9 +83,9 @@ def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, coun
     return PointCloud(found.points[kept], found.normals[kept], found.colours[kept])
 
 
-def _averaged(values: Tensor, points: Tensor, bounds: Sphere, count: int) -> Tensor:
-    """Means of the rows in the cells of the finest grid with at most `count` filled cells."""
-    low, high = FINEST, 4.0
+def _averaged(values: Float[Tensor, "point 9"], bounds: Sphere, count: int) -> Float[Tensor, "cell 9"]:
+    """Means of the rows, which begin with points, in the cells of the finest grid with at most `count` filled cells."""
+    points, low, high = values[:, :3], FINEST, 4.0
     for _ in range(HALVINGS):
         side = (low * high) ** 0.5
         filled = len(_cells(points, bounds, side).unique())

@@ -24,7 +24,7 @@ from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.files import format_of
 from hyperplanes.utilities.uncompiled_optimisers import Adam
 from hyperplanes.utilities.writing import write_whole
-from hyperplanes.views import Views
+from hyperplanes.views import Views, join_views
 
 __all__ = ["SPLAT_FORMATS", "Splats", "fit_splats", "save_splats", "splats_of"]
 
@@ -135,13 +135,14 @@ def fit_splats(
     if not steps:
         return splats
     views = views.to("cpu", torch.float32)
-    views = views if guide is None else _joined(views, guide)
+    if guide is not None:
+        views = join_views(replace(views, masks=None), guide.to("cpu", torch.float32))
     splats = splats[_weights(splats, views) > SEEN]
     size = float(splats.scales.mean()) if len(splats.scales) else 1.0
     # offsets of all parameters from their initial values, each kind with its learning rate
     free = {name: torch.zeros_like(getattr(splats, name)).requires_grad_() for name in RATES}
     descent = Adam([{"params": [free[name]], "lr": RATES[name]} for name in RATES], betas=(0.9, 0.99))
-    schedule = torch.optim.lr_scheduler.ExponentialLR(descent, 0.1 ** (1 / max(1, steps)))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(descent, 0.1 ** (1 / steps))
 
     rate = torch.tensor([1.0] + [DIRECTIONAL] * (HARMONICS - 1)).repeat(3)
 
@@ -167,13 +168,6 @@ def fit_splats(
             on_step(step + 1)
     with torch.no_grad():
         return moved()
-
-
-def _joined(views: Views, guide: Views) -> Views:
-    """All views, with the bounds of the first."""
-    guide = guide.to("cpu", torch.float32)
-    cameras = camera.concatenate([views.cameras, guide.cameras])
-    return Views(torch.cat([views.images, guide.images]), cameras, bounds=views.bounds)
 
 
 def _weights(splats: Splats, views: Views) -> Float[Tensor, " splat"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,12 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from jaxtyping import Float
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, normalize
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.export.mesh import Surface
+from hyperplanes.export.mesh import Surface, distances_to
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.against import fading, margins
 from hyperplanes.geometry.rays import cast, pixel_grid
@@ -152,27 +151,17 @@ def _texels(mesh: TexturedSurface) -> tuple[npt.NDArray[np.int64], ...]:
     return height - 1 - up[inside], column[inside], face[inside], shares  # pyright: ignore[reportReturnType]
 
 
-def _distances(
-    solid: trimesh.Trimesh, cameras: PinholeCamera, view: int, pixels: Float[Tensor, "pixel 2"]
-) -> Float[Tensor, " pixel"]:
-    """The distance of the surface at every pixel; infinite where there is none."""
-    rays = cast(cameras, torch.full((len(pixels),), view), pixels)
-    origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    found = solid.ray.intersects_id(origins, directions, multiple_hits=False, return_locations=True)
-    _, ray, place = found  # pyright: ignore[reportAssignmentType]
-    distances = np.full(len(pixels), np.inf, np.float32)
-    distances[ray] = np.linalg.norm(place - origins[ray], axis=1)
-    return torch.from_numpy(distances)
-
-
-def _seen(solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views) -> Any:  # noqa: ANN401
-    """Yield the colours (texel, 3) of the points in each view, and their weights (texel, 1)."""
+def _seen(
+    solid: trimesh.Trimesh, points: Tensor, outward: Tensor, views: Views
+) -> Iterator[tuple[Float[Tensor, "texel 3"], Float[Tensor, "texel 1"]]]:
+    """Yield the colours of the points in each view, and their weights."""
     height, width = views.size
     pixels, last = pixel_grid(height, width), torch.tensor([width - 1, height - 1])
     borders = torch.zeros(len(views), 4) if views.masks is None else margins(views.masks)
     for view in range(len(views)):
         one = camera.select(views.cameras, [view])
-        depth = _distances(solid, views.cameras, view, pixels).reshape(1, 1, height, width)
+        through = cast(views.cameras, torch.full((len(pixels),), view), pixels)
+        depth = distances_to(solid, through).reshape(1, 1, height, width)
         edge = max_pool2d(depth, 3, 1, 1) + max_pool2d(-depth, 3, 1, 1)  # range of a pixel and its neighbours
         maps = torch.cat([depth, edge], 1).nan_to_num(nan=1e9, posinf=1e9)
         pixel = 1 / float(camera.intrinsics(one)[0, 0, 0])  # its side at unit distance
@@ -233,8 +222,5 @@ def save_textured(mesh: TexturedSurface, path: str | Path) -> Path:
         tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), "KHR_materials_unlit"})
 
-    buffer = io.BytesIO()
-    scene = trimesh.Scene(solid)
-    buffer.write(export_glb(scene, include_normals=True, tree_postprocessor=unlit))
-    write_whole(path, buffer.getvalue())
+    write_whole(path, export_glb(trimesh.Scene(solid), include_normals=True, tree_postprocessor=unlit))
     return path

@@ -108,7 +108,7 @@ def fit_voxels(
     depth, colour = (baked.values[:, :1] * voxel).clamp(SMALLEST_DEPTH, LARGEST_DEPTH), baked.values[:, 1:].clone()
     groups = [{"params": [depth], "lr": DENSITY_RATE}, {"params": [colour], "lr": COLOUR_RATE}]
     descent = Adam(groups, betas=(0.9, 0.99), fused=True)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(descent, DECAY ** (1 / max(1, steps)))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(descent, DECAY ** (1 / steps))
     # reused by the kernel: allocating memory in each step would take longer than filling it
     values, gradients = baked.values.clone(), torch.empty(torch.get_num_threads(), *baked.values.shape)
     depth.grad, colour.grad = torch.zeros_like(depth), torch.zeros_like(colour)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -120,8 +121,7 @@ class BakedField:
         """
         if self.side % 2:
             raise ValueError(f"side: expected an even number of voxels an axis, got {self.side}")
-        bits = (self.index >= 0).flatten().reshape(-1, 8).to(torch.uint8)
-        packed = (bits * (2 ** torch.arange(8, device=bits.device)).to(torch.uint8)).sum(1, dtype=torch.uint8)
+        packed = torch.from_numpy(np.packbits((self.index >= 0).cpu().numpy(), bitorder="little"))
         order = self.index.flatten()
         rows = self.values[order[order >= 0].long()]
         low, high = rows[:, 1:].aminmax(dim=0) if len(rows) else 2 * (rows.new_zeros(3 * HARMONICS),)
@@ -143,7 +143,7 @@ class BakedField:
         found = load_tensors(path)
         if {name: value.dtype for name, value in found.items()} != STORED:
             raise CheckpointError(f"{path}: expected a baked field, found tensors {sorted(found)}; `hyperplanes bake`")
-        bits = found["occupied"].reshape(-1, 1).bitwise_and((2 ** torch.arange(8)).to(torch.uint8)).bool().flatten()
+        bits = torch.from_numpy(np.unpackbits(found["occupied"].numpy(), bitorder="little")).bool()
         side, rows, numbers = round(len(bits) ** (1 / 3)), int(bits.sum()), 3 * HARMONICS
         shapes = {"scaled_density": (rows,), "coefficients": (rows, numbers), "range": (2, numbers), "sphere": (4,)}
         if side**3 != len(bits) or side > LARGEST_SIDE or any(found[n].shape != shape for n, shape in shapes.items()):

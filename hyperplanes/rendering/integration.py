@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Generator, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -175,10 +175,14 @@ def _by_importance(
 
 def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: float) -> tuple[Tensor, Tensor]:
     """Densities of the samples up to a transmittance of `stop`, and the indices of these samples."""
+
+    def evaluated(chosen: PackedSamples) -> Tensor:
+        points, _ = _packed_points(rays, chosen)
+        batches = points.split(points_per_batch(points.device))
+        return torch.cat([field.density_of(field.hidden(batch)) for batch in batches]).to(samples.distances)
+
     if not _gain_by_rounds(rays):
-        points, _ = _packed_points(rays, samples)
-        found = torch.cat([field.density_of(each) for each in _in_batches(field.hidden, points)])
-        return found.to(samples.distances), torch.arange(len(samples), device=points.device)
+        return evaluated(samples), torch.arange(len(samples), device=samples.ray.device)
     density = samples.distances.new_zeros(len(samples))
     rank, _ = _ranks(samples.ray, len(rays))
     optical_depth = density.new_zeros(len(rays))
@@ -189,9 +193,7 @@ def _densities(field: SplitField, rays: Rays, samples: PackedSamples, stop: floa
         reach += max(FIRST_REACH, reach)
         now = rank[remaining] < reach
         chosen, remaining = remaining[now], remaining[~now]
-        points, _ = _packed_points(rays, samples[chosen])
-        found = torch.cat([field.density_of(each) for each in _in_batches(field.hidden, points)])
-        density[chosen], reached[chosen] = found.to(density), True
+        density[chosen], reached[chosen] = evaluated(samples[chosen]), True
         optical_depth = optical_depth.index_add(0, samples.ray[chosen], density[chosen] * samples.step)
         remaining = remaining[optical_depth[samples.ray[remaining]] < -math.log(stop)]
     return density, reached.nonzero()[:, 0]
@@ -350,10 +352,6 @@ def _joined(batches: Iterable[tuple[Tensor, Any]], wanted: Tensor) -> Generator[
             held.append((index[chosen], values[chosen]))
     if held:
         yield torch.cat([place for place, _ in held]), join_hidden([part for _, part in held])
-
-
-def _in_batches(function: Callable[[Tensor], Any], points: Tensor) -> list[Any]:
-    return [function(part) for part in points.split(points_per_batch(points.device))]
 
 
 def _packed_points(rays: Rays, samples: PackedSamples) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,9 @@ __all__ = [
     "Scene",
     "SplitField",
     "can_be_joined",
+    "dtype_of",
     "evaluate",
+    "is_thread_safe",
     "join_hidden",
     "mapped",
     "points_per_batch",
@@ -58,6 +60,16 @@ class SplitField(Protocol):
         ...
 
 
+def dtype_of(field: FieldFunction) -> torch.dtype:
+    """The dtype in which a field expects points: its attribute `dtype`; float32 without one."""
+    return getattr(field, "dtype", torch.float32)
+
+
+def is_thread_safe(field: FieldFunction) -> bool:
+    """Whether several threads may evaluate a field at once: its attribute `thread_safe`; False without one."""
+    return getattr(field, "thread_safe", False)
+
+
 def mapped(
     field: FieldFunction,
     points: Callable[[Tensor], Tensor],
@@ -87,11 +99,11 @@ class _Mapped:
 
     @property
     def dtype(self) -> torch.dtype:
-        return getattr(self.field, "dtype", torch.float32)
+        return dtype_of(self.field)
 
     @property
     def thread_safe(self) -> bool:
-        return getattr(self.field, "thread_safe", False)
+        return is_thread_safe(self.field)
 
     def __call__(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         colour, density = self.field(self.points(points), self.directions(directions))
@@ -132,9 +144,8 @@ class Scene:
 
     @property
     def is_thread_safe(self) -> bool:
-        """Whether several threads may call its fields at once, by their attributes `thread_safe`."""
-        fields = (self.field, self.proposal or self.field)
-        return all(getattr(field, "thread_safe", False) for field in fields)
+        """Whether several threads may call its fields at once."""
+        return is_thread_safe(self.field) and (self.proposal is None or is_thread_safe(self.proposal))
 
 
 def evaluate(

@@ -153,4 +153,3 @@ def test_solid_voxels_are_those_of_the_ball_without_the_haze():
     assert found.occupied.all()
     centres = grid.centres().norm(dim=1)
     assert torch.equal(found.solid().occupied.flatten(), centres < 0.5)
-    assert found.solid(0.01).occupied.all()
