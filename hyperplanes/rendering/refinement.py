@@ -48,13 +48,15 @@ def refine(
 
     The density is evaluated at the centre of every occupied voxel that does not lie behind opaque ones, then, in voxels
     that would be dropped, at the centres of their eight parts, half a voxel apart. Voxels above the threshold are
-    dilated by one voxel, the margin, but never beyond the given grid. Of an object with sharp borders, this keeps:
+    dilated by one voxel, the margin, but never beyond the given grid. Of an object with sharp borders, this keeps,
+    without `margin_loss`:
 
     - in a grid of up to 60,000 occupied voxels, such as a visual hull: everything at least half a voxel thick;
     - in a larger one (without masks, so without a hull), which is first evaluated at half its resolution: everything
       two voxels thick, and everything half a voxel thick that is connected to it, by following neighbours.
 
-    Thinner parts may be missed, as samples on a ray may miss them.
+    Thinner parts may be missed, as samples on a ray may miss them. With `margin_loss`, as in `AdaptedField`, parts less
+    than a voxel thick may also lose those of their voxels in which the density is low.
 
     The threshold is the density at which a ray through the whole sphere would have an opacity of OPACITY_LOSS, so haze
     in many voxels counts as much as in one. On cars of 64 pixels, pictures with and without refinement have a PSNR to
