@@ -18,8 +18,9 @@ import torch
 from small_demo import demo_folder
 
 from benchmarks import __main__ as benchmarks_main
-from benchmarks import _timing, gpu, image_based, load, steps, tables, views
+from benchmarks import _timing, gpu, image_based, steps, tables, views
 from benchmarks import all as all_benchmarks
+from benchmarks import load as machine_load
 from benchmarks.load import OF_SPEED
 from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes, stacking
@@ -360,19 +361,19 @@ def test_the_load_is_the_time_that_all_cores_were_busy(tmp_path, monkeypatch):
     after = "cpu  110 25 35 4040 530 10 10 11 9 0\ncpu0 50 10 15 2000 250 3 3 4 0 0\n"
     clock = iter((10.0, 10.5))
     waiting = types.SimpleNamespace(perf_counter=lambda: next(clock), sleep=lambda _: statistics.write_text(after))
-    monkeypatch.setattr(load, "STATISTICS", statistics)
-    monkeypatch.setattr(load, "time", waiting)
-    assert load.measure_load(0.5) == pytest.approx(30 / os.sysconf("SC_CLK_TCK") / 0.5)
+    monkeypatch.setattr(machine_load, "STATISTICS", statistics)
+    monkeypatch.setattr(machine_load, "time", waiting)
+    assert machine_load.measure_load(0.5) == pytest.approx(30 / os.sysconf("SC_CLK_TCK") / 0.5)
     statistics.unlink()
     monkeypatch.setattr(os, "getloadavg", lambda: (0.7, 0.8, 0.9))
-    assert load.measure_load() == 0.7
+    assert machine_load.measure_load() == 0.7
 
 
 def test_a_busy_loop_in_another_process_raises_the_load():
     """Property: a busy loop in another process uses about one core, or less if the machine has other work."""
-    before = load.measure_load(0.2)
+    before = machine_load.measure_load(0.2)
     with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as other:
         time.sleep(0.3)
-        during = load.measure_load(0.5)
+        during = machine_load.measure_load(0.5)
         other.kill()
     assert during > min(before + 0.3, 0.8)

@@ -40,7 +40,7 @@ def test_perturbed_cameras_are_corrected():
 def test_the_plot_is_written(tmp_path, monkeypatch):
     """Another implementation: the pictures of the example's cameras, and the errors that it reports."""
     figures, save = [], Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *given, **how: figures.append(self) or save(self, *given, **how))
+    monkeypatch.setattr(Figure, "savefig", lambda self, *file, **how: figures.append(self) or save(self, *file, **how))
     scene, true = example.Blobs.make(2), cameras.fibonacci_sphere(1, 2.7)
     start = example.perturbed(true, 5.0, 0.03, 0)
     result = example.refine(scene, start, true, 8, 2)

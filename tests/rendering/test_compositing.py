@@ -143,8 +143,8 @@ def test_gradients_of_dense_compositing():
     colour, density, edges = (value.requires_grad_() for value in random_rays(rays=3, intervals=4))
 
     def pixels(*values):
-        seen, _ = composite(*values)
-        return seen.colour, seen.opacity, seen.depth
+        seen, weights = composite(*values)
+        return seen.colour, seen.opacity, seen.depth, weights
 
     assert torch.autograd.gradcheck(pixels, (colour, density, edges))
 
