@@ -24,6 +24,7 @@ import torch
 
 from benchmarks import tables
 from benchmarks.load import OF_SPEED
+from benchmarks.options import positive
 from hyperplanes.utilities.environment import usable_cores
 
 __all__ = ["COMMANDS", "OF_DATA", "OF_GPU", "OF_SUITES", "main"]
@@ -92,11 +93,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--meshes", type=Path, nargs="+", help="mesh files for captures")
     parser.add_argument("--quick", action="store_true", help="run each with --quick, to check that it runs")
     parser.add_argument("--under-load", action="store_true", help="measure even if other processes are busy")
-    parser.add_argument("--workers", type=int, default=usable_cores(), help="how many benchmarks of quality run in "
-                        "parallel; those of speed run alone, before them (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--workers", type=positive, default=usable_cores(), help="how many benchmarks of quality run "
+                        "in parallel; those of speed run alone, before them (default: %(default)s)")  # fmt: skip
     chosen = parser.parse_args(arguments)
-    if chosen.workers < 1:
-        parser.error(f"--workers: expected at least 1, got {chosen.workers}")
     commands = _commands(chosen)
     of_speed = {name: options for name, (benchmark, options) in commands.items() if benchmark in OF_SPEED}
     others = {name: options for name, (_, options) in commands.items() if name not in of_speed}

@@ -12,9 +12,12 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -148,13 +151,14 @@ def main(arguments: list[str]) -> int:
     for name in chosen.variant:
         for seed in chosen.seeds:
             begun = time.perf_counter()
-            model = trained(configured(name, chosen.steps, seed), data)
-            row: Row = {"name": name, "seed": seed, "steps": chosen.steps, "seconds": time.perf_counter() - begun}
-            for count in chosen.counts:
-                found = [_judged(model, each, count, chosen.objects) for each in sets.values()]
-                row[f"psnr_{count}"] = sum(found) / len(found)
-                if len(sets) > 1:
-                    row |= {f"psnr_{count}_{each}": value for each, value in zip(sets, found, strict=True)}
+            with configured(name, chosen.steps, seed) as made:
+                model = trained(made, data)
+                row: Row = {"name": name, "seed": seed, "steps": chosen.steps, "seconds": time.perf_counter() - begun}
+                for count in chosen.counts:
+                    found = [_judged(model, each, count, chosen.objects) for each in sets.values()]
+                    row[f"psnr_{count}"] = sum(found) / len(found)
+                    if len(sets) > 1:
+                        row |= {f"psnr_{count}_{each}": value for each, value in zip(sets, found, strict=True)}
             rows.append(row)
             print(row, flush=True)
     return finish("image_based", rows, chosen.json)
@@ -165,18 +169,28 @@ def _judged(model: HyperPlanes, data: Dataset, count: int, objects: int) -> floa
     return evaluate("one_step", model, Shown(data, count, 3), sorted(data.names("test"))[:objects]).mean("psnr")
 
 
-def configured(name: str, steps: int, seed: int) -> Preset:
+@contextmanager
+def configured(name: str, steps: int, seed: int) -> Generator[Preset]:
     """A variant of the preset "small", with a network of 3 x 96, a hull of 64 voxels per axis, and 128 rays per object.
 
-    Objects are not rotated, and pictures are rendered from the field alone, without `hull_blend`.
+    Objects are not rotated, and pictures are rendered from the field alone, without `hull_blend`. The field of the
+    variant has its name in `fields.TARGETS` while the context is active.
 
     Args:
         name: in VARIANTS or HYPERNETWORKS, or "white", which trains without random backgrounds. Only those in
             HYPERNETWORKS have a hypernetwork.
         steps: training steps.
         seed: of the training.
+
+    Yields:
+        The preset.
     """
-    TARGETS[name] = VARIANTS.get(name, ImageBasedNeRF)
+    with patch.dict(TARGETS, {name: VARIANTS.get(name, ImageBasedNeRF)}):
+        yield _preset(name, steps, seed)
+
+
+def _preset(name: str, steps: int, seed: int) -> Preset:
+    """The preset of a variant whose field is in TARGETS."""
     made, wanted = preset("small"), HYPERNETWORKS.get(name)
     training = replace(
         made.training,

@@ -25,6 +25,7 @@ from benchmarks._timing import add_device_option, copy_bandwidth, interleaved, p
 from benchmarks.load import load_at_start
 from benchmarks.lookup_plot import plot
 from benchmarks.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
+from benchmarks.options import positive
 from benchmarks.reporting import Row, write_rows
 from hyperplanes.utilities.environment import environment
 
@@ -96,7 +97,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--quick", action="store_true", help="fewer repetitions and settings, within a minute")
     parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="PNG file to plot them to")
-    parser.add_argument("--threads", type=int, metavar="N", help="number of threads of PyTorch and the kernels")
+    parser.add_argument("--threads", type=positive, metavar="N", help="number of threads of PyTorch and the kernels")
     add_device_option(parser, "cpu")
     options = parser.parse_args(arguments)
     if options.threads:

@@ -45,12 +45,10 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--data", type=Path, help="a data set (default: procedural cars)")
     parser.add_argument("--untrained", action="store_true", help="start from initial weights, not the packaged ones")
     parser.add_argument("--repeats", type=positive, default=12, help="steps of each kind (default: %(default)s)")
-    parser.add_argument("--threads", type=int, default=1, help="number of threads (default: %(default)s)")
+    parser.add_argument("--threads", type=positive, default=1, help="number of threads (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="small images, one step of each kind")
     parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
-    if chosen.threads < 1:
-        parser.error(f"--threads: expected at least 1, got {chosen.threads}")
     before = torch.get_num_threads()
     torch.set_num_threads(chosen.threads)
     try:

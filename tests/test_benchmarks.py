@@ -3,12 +3,14 @@
 import importlib
 import inspect
 import json
+import os
 import re
 import subprocess
 import sys
 import threading
 import time
 import types
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -18,10 +20,12 @@ from small_demo import demo_folder
 from benchmarks import __main__ as benchmarks_main
 from benchmarks import _timing, gpu, image_based, steps, tables, views
 from benchmarks import all as all_benchmarks
+from benchmarks import load as machine_load
 from benchmarks.load import OF_SPEED
 from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes, stacking
-from hyperplanes.rendering import RayMarching
+from hyperplanes.fields import TARGETS, ImageBasedNeRF
+from hyperplanes.rendering import RayMarching, renderer
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.utilities.environment import usable_cores
 from hyperplanes.utilities.files import DataError
@@ -31,15 +35,18 @@ from tests.training.test_volume_loss import MODEL
 
 @pytest.mark.parametrize("name", [*image_based.VARIANTS, *image_based.HYPERNETWORKS])
 def test_every_weight_of_every_variant_is_trained(name):
-    made = image_based.configured(name, 4, 0)
-    small = replace(made.model.network, depth=2, width=16, planes=3)
-    model = HyperPlanes(replace(made.model, network=small, hull_resolution=16))
-    training = replace(made.training, tasks=1, rays=48, views=(3, 5), episodes=4)
-    trainer = Trainer(model, Balls(views=6, size=(24, 24)), training)
-    for _ in range(3):  # outputs of a hypernetwork start at zero and pass no gradients in the first step
-        trainer.take_step()
-    dead = {key for key, value in model.named_parameters() if value.grad is None or not value.grad.any()}
-    assert not {key for key in dead if not key.startswith("hypernetwork")}, name
+    before = dict(TARGETS)
+    with image_based.configured(name, 4, 0) as made:
+        assert TARGETS == before | {name: image_based.VARIANTS.get(name, ImageBasedNeRF)}
+        small = replace(made.model.network, depth=2, width=16, planes=3)
+        model = HyperPlanes(replace(made.model, network=small, hull_resolution=16))
+        training = replace(made.training, tasks=1, rays=48, views=(3, 5), episodes=4)
+        trainer = Trainer(model, Balls(views=6, size=(24, 24)), training)
+        for _ in range(3):  # outputs of a hypernetwork start at zero and pass no gradients in the first step
+            trainer.take_step()
+    assert TARGETS == before, "other benchmarks in this process do not know the variant"
+    assert not {key for key, value in model.named_parameters() if value.grad is None or not value.grad.any()}
+    assert any(key.startswith("hypernetwork") for key in model.state_dict()) == (name in image_based.HYPERNETWORKS)
 
 
 def test_the_unstacked_field_of_a_model_without_stacking_is_that_of_the_model():
@@ -97,6 +104,10 @@ def test_the_benchmark_of_views_fine_tunes_only_on_two_views_or_more(tmp_path):
     [
         (["captures", "--quick", "--meshes", "OUT/none"], "none: expected a folder of meshes, found nothing"),
         (["captures", "--quick", "--count", "0"], "--count: expected a whole number of at least 1, got '0'"),
+        (["lookup", "--threads", "-1"], "--threads: expected a whole number of at least 1, got '-1'"),
+        (["lookup", "--threads", "0"], "--threads: expected a whole number of at least 1, got '0'"),
+        (["steps", "--threads", "0"], "--threads: expected a whole number of at least 1, got '0'"),
+        (["all", "--workers", "0"], "--workers: expected a whole number of at least 1, got '0'"),
         (["small", "--sizes", "0"], "--sizes: expected a whole number of at least 1, got '0'"),
         (["splats", "--objects", "zebra"], "class: expected one of car, chair, plane, lamp, random, got 'zebra'"),
         (["views", "--data", "DATA", "--objects", "0"], "--objects: expected a whole number of at least 1, got '0'"),
@@ -256,11 +267,18 @@ def test_all_runs_benchmarks_of_speed_alone_and_of_quality_in_parallel(tmp_path,
     assert not any(OF_SPEED & set(names) for names in beside[False])
 
 
-def test_implementations_of_rendering_show_the_same_field():
+def test_implementations_of_rendering_show_the_same_field(monkeypatch):
+    """One of them renders without TF32, which a CPU does not have; whether it is asked for shows on all devices."""
+    asked, allowed = [], {}
+    monkeypatch.setattr(renderer, "allow_tf32", lambda device: asked.append(device) or nullcontext())
     model, task = HyperPlanes(MODEL), Balls(views=6, size=(24, 24)).task("train0")
     adapted, cameras = model.adapt(task.support), task.query.cameras
     expected = adapted.render(cameras, antialias=False, mixed_precision=False).images
-    found = {name: draw(cameras) for name, draw in gpu._ways(adapted, torch.device("cpu")).items()}
+    found = {}
+    for name, draw in gpu._ways(adapted, torch.device("cpu")).items():
+        asked.clear()
+        found[name], allowed[name] = draw(cameras), bool(asked)
+    assert [name for name in found if not allowed[name]] == ["no TF32"]
     assert not torch.equal(found.pop("layers in bfloat16"), expected)
     assert found.keys() == {"lookups by PyTorch", "no TF32", "field as a function"}
     for images in found.values():
@@ -336,13 +354,26 @@ def test_tables_of_views_take_the_rows_of_all_suites(tmp_path):
     assert f"*Commit abc1234 ({files}); Commit def5678 (views_posed.json).*" in found
 
 
+def test_the_load_is_the_time_that_all_cores_were_busy(tmp_path, monkeypatch):
+    """By hand: 30 busy ticks in half a second. Idle cores, and those that wait for a disk, do not count."""
+    statistics = tmp_path / "stat"
+    statistics.write_text("cpu  100 20 30 4000 500 6 7 8 0 0\ncpu0 50 10 15 2000 250 3 3 4 0 0\n")
+    after = "cpu  110 25 35 4040 530 10 10 11 9 0\ncpu0 50 10 15 2000 250 3 3 4 0 0\n"
+    clock = iter((10.0, 10.5))
+    waiting = types.SimpleNamespace(perf_counter=lambda: next(clock), sleep=lambda _: statistics.write_text(after))
+    monkeypatch.setattr(machine_load, "STATISTICS", statistics)
+    monkeypatch.setattr(machine_load, "time", waiting)
+    assert machine_load.measure_load(0.5) == pytest.approx(30 / os.sysconf("SC_CLK_TCK") / 0.5)
+    statistics.unlink()
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.7, 0.8, 0.9))
+    assert machine_load.measure_load() == 0.7
+
+
 def test_a_busy_loop_in_another_process_raises_the_load():
     """Property: a busy loop in another process uses about one core, or less if the machine has other work."""
-    from benchmarks.load import measure_load
-
-    before = measure_load(0.2)
+    before = machine_load.measure_load(0.2)
     with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as other:
         time.sleep(0.3)
-        during = measure_load(0.5)
+        during = machine_load.measure_load(0.5)
         other.kill()
     assert during > min(before + 0.3, 0.8)

@@ -10,6 +10,7 @@ import torch
 from kornia.geometry.conversions import normalize_pixel_coordinates
 from scipy.ndimage import map_coordinates
 
+from hyperplanes.data.formats.transforms_document import calibration, transforms_document
 from hyperplanes.geometry import ImagePlanes, Sphere, cameras, cast
 from hyperplanes.geometry.lookup import lookup
 from hyperplanes.geometry.lookup_torch import interpolate, project
@@ -51,10 +52,10 @@ def test_projection_agrees_with_opencv(axes, centres):
         torch.testing.assert_close(cameras.opengl_from_opencv(pose), stored)
         pose = cameras.opencv_from_opengl(stored)
     if centres == "half":  # pixel (0, 0) centred at (0.5, 0.5): the principal point is stored half a pixel further
-        stored_matrix = K.clone()
-        stored_matrix[:2, 2] += 0.5
-        matrix = stored_matrix.clone()
-        matrix[:2, 2] -= 0.5
+        stored = {"fl_x": 70.0, "fl_y": 95.0, "cx": 33.5, "cy": 28.0, "w": WIDTH, "h": HEIGHT}
+        matrix = torch.from_numpy(calibration(stored, (HEIGHT, WIDTH), "transforms.json"))
+        document = transforms_document(np.eye(4)[None], matrix.numpy()[None], (HEIGHT, WIDTH), ["0.png"])
+        assert {name: document[name] for name in stored} == stored
     ours = cameras.pinhole(matrix, pose, HEIGHT, WIDTH)
     pixels, front = project(some_points(), cameras.projection_matrices(ours), None)
     assert front.all()

@@ -24,7 +24,7 @@ from hyperplanes.methods import Unchecked
 from hyperplanes.rendering.renderer import render
 from hyperplanes.utilities import memory
 from hyperplanes.utilities.environment import cache_folder
-from tests.fuzz.corpus import posed_scene, small_model
+from tests.fuzz.corpus import data_set, posed_scene, small_model
 from tests.reference_rendering import ring
 
 GIGABYTE = 10**9
@@ -66,10 +66,11 @@ def test_sizes_that_do_not_fit_into_memory_are_refused_in_one_line(options, mess
 
 
 @pytest.mark.parametrize("option", ["--devices", "--nodes"])
-def test_training_with_no_process_is_refused(option, scene, capsys):
-    command = ["train", "--data", str(scene / "scene"), "--out", str(scene / "out"), option, "0"]
+def test_training_with_no_process_is_refused(option, tmp_path, capsys):
+    data_set(tmp_path / "data")
+    command = ["train", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out"), option, "0"]
     assert main(command) == 2
-    assert error_line(capsys).startswith("hyperplanes train: ")
+    assert error_line(capsys) == f"hyperplanes train: {option}: expected at least 1, got 0"
 
 
 def test_available_memory_is_known_and_small_amounts_are_not_checked(monkeypatch):

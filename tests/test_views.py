@@ -8,7 +8,7 @@ import torch
 
 from hyperplanes.geometry.cameras import centres, cropped, image_size, pinhole, resized, select
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.views import Task, Views
+from hyperplanes.views import Views
 from tests.reference_rendering import ring, small_model
 
 NAMES = ("a", "b", "c", "d")
@@ -223,10 +223,6 @@ def test_the_size_of_the_cameras_determines_which_dimension_is_which(size):
     if size[0] != 3 or size[1] != 3:
         with pytest.raises(ValueError, match=r"^images: expected channels before rows, .*; write images\.permute"):
             Views(images.permute(0, 2, 3, 1), cameras)
-
-
-def test_a_task_names_its_object():
-    assert Task(views(), views(), "car").name == "car"
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -225,6 +225,7 @@ class Recorder:
 def test_with_two_views_the_view_of_the_rays_is_masked():
     recorder = Recorder(views(2))
     list(recorder.descent(views(2), FineTuning(rays=16)).run(8))
+    assert len(recorder.notes) == 8
     assert all(hidden == sources and len(hidden) == 1 for hidden, sources in recorder.notes)
 
 

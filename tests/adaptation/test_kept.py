@@ -1,5 +1,6 @@
 """The cache of fields on disk. Source of truth: the stored field, and a key that changes with every input."""
 
+import os
 from dataclasses import replace
 
 import pytest
@@ -61,7 +62,11 @@ def test_the_folder_depends_on_views_steps_and_options(model, views):
 
 
 def test_the_oldest_fields_are_removed(model, views, field, tmp_path):
-    for number in range(MOST):
-        (tmp_path / "adapted" / f"old{number}").mkdir(parents=True)
-    keep_field(model, field, kept_folder(model, views, 0, FineTuning()))
-    assert len(list((tmp_path / "adapted").iterdir())) == MOST
+    """The times of the folders are in another order than their names."""
+    folder = kept_folder(model, views, 0, FineTuning())
+    names = [f"old{number}" for number in range(MOST)]
+    for age, name in enumerate(names[4:] + names[:4]):
+        (tmp_path / "adapted" / name).mkdir(parents=True)
+        os.utime(tmp_path / "adapted" / name, (1000.0 + age, 1000.0 + age))
+    keep_field(model, field, folder)
+    assert {path.name for path in (tmp_path / "adapted").iterdir()} == {*names, folder.name} - {"old4"}

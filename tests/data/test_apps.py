@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from test_formats import FOCAL, HEIGHT, VIEWS, WIDTH, expected, eyes_and_axes, found, pictures
+from test_formats import FOCAL, HEIGHT, VIEWS, WIDTH, are_graded, expected, eyes_and_axes, found, graded_masks, pictures
 
 from hyperplanes.commands.scene import refuse_sources
 from hyperplanes.data import DataError, open_dataset, read_task, read_views
@@ -100,8 +100,8 @@ def test_polycam(tmp_path):
         path.write_text(path.read_text().replace('"t_03": ', '"t_03": 1'))
     polycam(tmp_path, "corrected_")
     np.testing.assert_allclose(found(read_views(tmp_path / "keyframes")), expected(CENTRE), atol=1e-3)
-    pictures(tmp_path / "keyframes/masks", [f"{1000 + index}.png" for index in range(VIEWS)])
-    assert read_views(tmp_path).masks is not None
+    graded_masks(tmp_path / "keyframes/masks", [f"{1000 + index}.png" for index in range(VIEWS)])
+    assert are_graded(read_views(tmp_path).masks)
     broken = tmp_path / "keyframes/corrected_cameras/1002.json"
     broken.write_text(broken.read_text().replace('"fx"', '"f"'))
     with pytest.raises(DataError, match=r"1002\.json: expected a camera of Polycam: .*found something else: KeyError"):
@@ -134,8 +134,8 @@ def test_realitycapture(tmp_path, head):
     pictures(tmp_path / "images", NAMES)
     realitycapture(tmp_path, head=head)
     np.testing.assert_allclose(found(read_views(tmp_path)), expected(CENTRE), atol=1e-3)
-    pictures(tmp_path / "masks", [name.replace("JPG", "png") for name in NAMES])
-    assert read_views(tmp_path).masks is not None
+    graded_masks(tmp_path / "masks", [name.replace("JPG", "png") for name in NAMES])
+    assert are_graded(read_views(tmp_path).masks)
     whole = (tmp_path / "cameras.csv").read_text()
     for old, new, match in (
         ("IMG_2.JPG,", "IMG_2.JPG,east", r"line \d: expected a number as x, found 'east"),

@@ -45,6 +45,18 @@ def pictures(folder, names, mode="RGB", size=(WIDTH, HEIGHT)):
         Image.new(mode, size, tuple([20 * index, 50, 90, 128][: len(mode)])).save(folder / name)
 
 
+def graded_masks(folder, names):
+    """Write a mask for each image, of another grey level each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, name in enumerate(names):
+        Image.new("L", (WIDTH, HEIGHT), 40 * index).save(folder / name)
+
+
+def are_graded(masks):
+    """Whether every image has its own mask of `graded_masks`."""
+    return (masks.amax((1, 2, 3)) * 255).round().tolist() == [40 * index for index in range(VIEWS)]
+
+
 def llff(folder, **change):
     rows = []
     for eye, right, down, forward in eyes_and_axes():
@@ -73,13 +85,8 @@ def test_llff(tmp_path):
 def test_masks_next_to_the_pictures_of_llff(tmp_path):
     """Source of truth: the written masks. The product's error message says to add that folder."""
     llff(tmp_path)
-    names = [f"IMG_{index}.png" for index in range(VIEWS)]
-    for index, name in enumerate(names):
-        (tmp_path / "masks").mkdir(exist_ok=True)
-        Image.new("L", (WIDTH, HEIGHT), 40 * index).save(tmp_path / "masks" / name)
-    masks = read_views(tmp_path).masks
-    assert masks is not None
-    assert (masks.amax((1, 2, 3)) * 255).round().tolist() == [40 * index for index in range(VIEWS)]
+    graded_masks(tmp_path / "masks", [f"IMG_{index}.png" for index in range(VIEWS)])
+    assert are_graded(read_views(tmp_path).masks)
     (tmp_path / "masks/IMG_3.png").unlink()
     with pytest.raises(DataError, match=r"masks: expected a mask for each of the 6 images, found 5, none for IMG_3"):
         read_views(tmp_path)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from test_formats import FOCAL, HEIGHT, VIEWS, WIDTH, expected, eyes_and_axes, found, pictures
+from test_formats import FOCAL, HEIGHT, VIEWS, WIDTH, are_graded, expected, eyes_and_axes, found, graded_masks, pictures
 
 from hyperplanes.data import DataError, open_dataset, read_views
 
@@ -29,7 +29,7 @@ def nmr(folder):
         arrays[f"world_mat_{index}"] = np.vstack([pose, [0, 0, 0, 1]])
         arrays[f"camera_mat_{index}"] = np.diag([FOCAL / (WIDTH / 2), FOCAL / (HEIGHT / 2), 1, 1])
     pictures(folder / "image", [f"{index:04d}.png" for index in range(VIEWS)])
-    pictures(folder / "mask", [f"{index:04d}.png" for index in range(VIEWS)])
+    graded_masks(folder / "mask", [f"{index:04d}.png" for index in range(VIEWS)])
     np.savez(folder / "cameras.npz", **arrays)
 
 
@@ -43,7 +43,7 @@ def test_nmr(tmp_path):
     assert "skipped 1 of 3 objects" in data.skipped[0]
     views = read_views(tmp_path / "02958343/a")
     np.testing.assert_allclose(found(views), expected(), atol=1e-3)
-    assert views.masks is not None
+    assert are_graded(views.masks)
     assert len(data.task("c").support) == 3
     (tmp_path / "02958343/softras_test.lst").write_text("../a\n")
     with pytest.raises(DataError, match="softras_test.lst: expected a plain name"):

@@ -124,9 +124,12 @@ def test_reprojection_errors_of_colmap(tmp_path, binary):
     assert (len(found.places), found.error) == (3, pytest.approx(2.4))
     np.testing.assert_array_equal(found.places[1], [3, 4, 5])
     views = replace(standing((0, 0), (20, 0)), names=("a.png", "b.png"))
-    said = "\n".join(describe_scene(views, replace(found, errors={"a.png": 1.0, "b.png": 4.0})).lines())
-    assert "reprojection error: 2.40 pixels (mean, 3 points), 4.00 in the worst view (b.png)" in said
-    assert "reprojection error 4.0 pixels, in the median 2.5" not in said, "less than twice the median"
+    report = describe_scene(views, replace(found, errors={"a.png": 1.0, "b.png": 4.0}))
+    assert "reprojection error: 2.40 pixels (mean, 3 points), 4.00 in the worst view (b.png)" in report.lines()
+    assert [view.faults for view in report.views] == [(), ()], "less than twice the median"
+    views = replace(standing((0, 0), (20, 0), (40, 0)), names=("a.png", "b.png", "c.png"))
+    report = describe_scene(views, replace(found, errors={"a.png": 2.0, "b.png": 4.1, "c.png": 1.0}))
+    assert [view.faults for view in report.views] == [(), ("reprojection error 4.1 pixels, in the median 2.0",), ()]
 
 
 def test_the_silhouette_of_a_solid_hull_has_no_gaps():

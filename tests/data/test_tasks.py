@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -102,14 +103,22 @@ def test_files_are_written_completely_or_not_at_all(tmp_path):
     assert [entry.name for entry in path.parent.iterdir()] == ["file"]
 
 
-def test_encoding_is_deterministic(scene):
-    assert encode_png(scene.pictures[0]) == encode_png(scene.pictures[0].copy())
+def test_encoding_is_deterministic(scene, monkeypatch):
+    """Also later: archives have times in steps of two seconds."""
+    arrays = {"depth": scene.matrix}
+
+    def encoded():
+        picture = scene.pictures[0].copy()
+        return encode_png(picture), encode_png(picture, small=True), encode_npz(arrays)
+
+    before, now = encoded(), time.time()
+    with monkeypatch.context() as later:
+        later.setattr(time, "time", lambda: now + 10**6)
+        assert encoded() == before
     generator = np.random.default_rng(0)
     for shape, kind in (((3, 5), np.uint8), ((3, 5, 3), np.uint8), ((3, 5, 4), np.uint8), ((3, 5), np.uint16)):
         pixels = generator.integers(0, np.iinfo(kind).max, shape, dtype=kind, endpoint=True)
         assert np.array_equal(np.asarray(Image.open(io.BytesIO(encode_png(pixels)))), pixels)
-    arrays = {"depth": scene.matrix}
-    assert encode_npz(arrays) == encode_npz(arrays)
 
 
 def test_a_huge_json_file_is_refused_without_reading_it(tmp_path):

@@ -174,7 +174,10 @@ def test_meshes_are_read_back_with_their_colours(kind, tmp_path):
     read = trimesh.load(path, force="mesh", process=False)
     assert len(read.faces) == len(surface.faces)
     colours = np.asarray(read.visual.vertex_colors)[:, :3]
-    assert {tuple(colour) for colour in colours} <= {(255, 0, 0), (0, 0, 255)}
+    assert {tuple(colour) for colour in colours} == {(255, 0, 0), (0, 0, 255)}
+    side = read.vertices[:, 0] - CENTRE[0]
+    clear = np.abs(side) > 0.02
+    np.testing.assert_array_equal(colours[clear, 0] == 255, side[clear] > 0)
 
 
 def test_another_format_of_a_mesh_is_refused(tmp_path):

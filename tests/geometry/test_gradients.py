@@ -9,7 +9,6 @@ from hyperplanes.geometry.distortion import distorted
 from hyperplanes.geometry.lookup import lookup
 from hyperplanes.geometry.lookup_torch import interpolate, project
 from hyperplanes.geometry.occupancy import full
-from hyperplanes.rendering.compositing import composite
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching, render
 
 
@@ -97,19 +96,6 @@ def test_rays():
     small = torch.zeros(4, dtype=torch.float64), torch.zeros(2, 6, dtype=torch.float64)
     leaves = (pixels, *(value.requires_grad_() for value in small), lens)
     assert gradcheck(lambda *values: tuple(run(*values)), leaves)
-
-
-def test_compositing():
-    generator = torch.Generator().manual_seed(0)
-    colour = torch.rand(2, 4, 3, generator=generator, dtype=torch.float64, requires_grad=True)
-    density = torch.rand(2, 4, generator=generator, dtype=torch.float64, requires_grad=True)
-    edges = torch.linspace(1, 2, 5, dtype=torch.float64).expand(2, 5).clone().requires_grad_()
-
-    def run(*values):
-        pixels, weights = composite(*values)
-        return pixels.colour, pixels.opacity, pixels.depth, weights
-
-    assert gradcheck(run, (colour, density, edges))
 
 
 @pytest.mark.parametrize("backend", ["torch", "cpu"])

@@ -190,13 +190,6 @@ def test_every_option_changes_the_update(change):
 
 
 @torch.no_grad()
-def test_directions_can_be_omitted_from_a_mean():
-    images, directions, theta = inputs()
-    blind = make(replace(CONFIG, join="mean", see_directions=False))
-    assert not differs(blind(images, directions, theta), blind(images, directions.flip(0), theta))
-
-
-@torch.no_grad()
 def test_the_mean_of_codes_does_not_depend_on_the_order_of_views():
     network = make(replace(CONFIG, join="mean"))
     images, directions, theta = inputs()

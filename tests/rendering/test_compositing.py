@@ -143,9 +143,10 @@ def test_gradients_of_dense_compositing():
     colour, density, edges = (value.requires_grad_() for value in random_rays(rays=3, intervals=4))
 
     def pixels(*values):
-        seen, _ = composite(*values)
-        return seen.colour, seen.opacity, seen.depth
+        seen, weights = composite(*values)
+        return seen.colour, seen.opacity, seen.depth, weights
 
+    assert all(each.requires_grad for each in pixels(colour, density, edges)), "gradcheck skips the others"
     assert torch.autograd.gradcheck(pixels, (colour, density, edges))
 
 
@@ -160,6 +161,7 @@ def test_gradients_of_packed_compositing():
         seen = composite_packed(colour, packed_weights(thickness, ray, 5), middles, ray, 5)
         return seen.colour, seen.opacity, seen.depth
 
+    assert all(each.requires_grad for each in pixels(colour, thickness, middles)), "gradcheck skips the others"
     assert torch.autograd.gradcheck(pixels, (colour, thickness, middles))
 
 

@@ -83,6 +83,8 @@ def test_the_kernel_loses_no_sample_of_few_voxels():
 def test_samples_are_sorted_by_ray_and_distance():
     found = march(some_rays(50), full(Sphere(), 4), 0.1, torch.Generator().manual_seed(0))
     same = found.ray.diff() == 0
+    assert same.sum() > 500
+    assert set(found.ray.tolist()) == set(range(50))
     assert (found.ray.diff() >= 0).all()
     torch.testing.assert_close(found.distances.diff()[same], torch.full_like(found.distances.diff()[same], 0.1))
 
@@ -154,6 +156,9 @@ def test_samples_lie_within_the_cube_of_the_grid():
     found = march(rays, full(Sphere(), 4), 0.1)
     points = rays.origins[found.ray] + found.distances[:, None] * rays.directions[found.ray]
     assert (points.abs() <= 1).all()
+    assert set(found.ray.tolist()) == set(range(20))
+    beyond = rays.origins + rays.near[:, None] * rays.directions
+    assert (beyond.abs() > 1).any(), "rays begin outside the cube"
 
 
 def test_the_number_of_steps_of_pictures_is_limited():

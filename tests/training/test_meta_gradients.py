@@ -1,11 +1,14 @@
 """Source of truth: gradient steps of a linear regression, computed by hand, and finite differences."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from hyperplanes.adaptation import InitialisationConfig
 from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.fine_tuned import shuffled
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.meta_gradients import maml_gradient, reptile_gradient
 from tests.reference_rendering import ball_views, ring, small_model
@@ -103,7 +106,12 @@ def test_descent_is_plain_with_a_constant_rate_by_default():
         "weights",
     )
     assert settings.schedule(0, 10) == settings.schedule(9, 10) == 1
-    told = config.descent(5, given=type(settings)(optimiser="adam", learning_rate=1e-3, seed=4))
+    given = FineTuning(learning_rate=1e-3, final_rate_factor=0.2, seed=4)
+    told = config.descent(5, given=given)
+    assert (told.optimiser, told.learning_rate, told.rays, told.seed) == ("sgd", 1e-3, 5, 4)
+    assert told.schedule(9, 10) == told.final_rate_factor == 1
+    told = config.descent(5, given=replace(given, optimiser="adam"))
     assert (told.optimiser, told.learning_rate, told.rays, told.seed) == ("adam", 1e-3, 5, 4)
+    assert told.final_rate_factor == 0.2
     with pytest.raises(ValueError, match="method: expected one of mv_meta, .*, got 'reptile'"):
         InitialisationConfig(method="reptile")

@@ -8,7 +8,6 @@ import torch
 from hyperplanes.adaptation import FineTuned, HyperPlanes, InitialisationConfig
 from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.fine_tuned import shuffled
-from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data.support import SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.hypernetwork import AutoencoderConfig
@@ -189,14 +188,6 @@ def test_a_field_of_any_number_of_views_is_not_trained_on_one_view_per_object():
     model = HyperPlanes(replace(MODEL, hypernetwork=None, initialisation=InitialisationConfig("sv_meta")))
     with pytest.raises(ValueError, match="sv_meta: expected a field with a fixed number of views, got image_based"):
         initialisation_trainer(model, Balls(), FAST, None)
-
-
-def test_gradient_steps_from_an_initialisation_are_plain_descent_by_default():
-    config, given = InitialisationConfig(inner_rate=0.3), FineTuning(learning_rate=0.1, final_rate_factor=0.2, seed=4)
-    for rate, settings in ((0.3, config.descent()), (0.1, config.descent(given=given))):
-        assert (settings.optimiser, settings.learning_rate, settings.final_rate_factor) == ("sgd", rate, 1.0)
-    adam = config.descent(given=replace(given, optimiser="adam"))
-    assert (adam.optimiser, adam.learning_rate, adam.final_rate_factor, adam.seed) == ("adam", 0.1, 0.2, 4)
 
 
 def test_results_do_not_depend_on_the_order_of_objects_and_the_initialisation_is_unchanged():

@@ -365,17 +365,27 @@ def test_a_rate_of_zero_freezes_only_its_part(frozen):
 
 
 def test_with_antialias_each_pixel_of_a_training_has_three_rays(monkeypatch):
-    counts = []
-    trace = base.AdaptedField.trace
-    monkeypatch.setattr(
-        base.AdaptedField,
-        "trace",
-        lambda self, rays, generator=None: counts.append(len(rays)) or trace(self, rays, generator),
-    )
+    """Closed form: the loss is the mean square of their mean colours minus the colours of the pixels."""
+    traced, outputs, trace = [], [], base.AdaptedField.trace
+
+    def noting_rays(self, rays, generator=None):
+        traced.append((rays, trace(self, rays, generator)))
+        return traced[-1][1]
+
+    def noting_outputs(*given):
+        outputs.append(forward(*given))
+        return outputs[-1]
+
+    monkeypatch.setattr(base.AdaptedField, "trace", noting_rays)
+    monkeypatch.setattr(objective, "forward", noting_outputs)
     for antialias, times in ((False, 1), (True, 3)):
-        counts.clear()
-        assert 0 < losses(small_model(), with_(antialias=antialias), 1)[0] < 10
-        assert set(counts) == {times * FAST.rays}
+        traced.clear()
+        loss = losses(small_model(), with_(antialias=antialias, tasks=1), 1)[0]
+        ((rays, rendered),) = traced
+        directions = rays.directions.reshape(times, FAST.rays, 3)
+        assert (directions[1:] != directions[0]).any(-1).all()
+        mean = rendered.colour.reshape(times, FAST.rays, 3).mean(0)
+        assert loss == pytest.approx(float((mean - outputs[-1].truth).square().mean().detach()))
 
 
 def test_muon_changes_the_hidden_matrices_at_its_own_rate():
