@@ -960,7 +960,7 @@ def test_the_scene_that_comes_with_the_package_has_a_name(tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("hyperplanes.adaptation.canonical_frame.find_symmetry", lambda *_: None)
     assert main(["evaluate", "--data", "example-car", "--method", "nearest_view"]) == 0
-    assert "1 objects of example-car" in capsys.readouterr().out
+    assert "1 object of example-car" in capsys.readouterr().out
     assert main(["inspect", "example-car"]) == 0
     told = capsys.readouterr().out
     assert "views: 25 support, 25 query" in told
