@@ -175,4 +175,4 @@ def test_masks_that_show_the_background_are_found(scene):
     assert check_masks(replace(views, masks=None)) is None
     masks = views.masks.clone()
     masks[[2, 5]] = 1 - masks[[2, 5]]
-    assert "masks: WRONG, 2 of 12 seem to show the background (2, 5)" in check_masks(replace(views, masks=masks))
+    assert check_masks(replace(views, masks=masks)) == "masks: WRONG, 2 of 12 seem to show the background"
