@@ -95,11 +95,13 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 @contextmanager
 def _one_line_warnings() -> Generator[None]:
-    """Print a UserWarning as its message, without the place in the code that raised it."""
+    """Print a UserWarning as one line, without the place in the code that raised it."""
     usual = warnings.formatwarning
 
     def formatted(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> str:
-        return f"warning: {message}\n" if category is UserWarning else usual(message, category, *place, **more)
+        if category is not UserWarning:
+            return usual(message, category, *place, **more)
+        return f"warning: {' '.join(str(message).split())}\n"
 
     warnings.formatwarning = formatted
     try:

@@ -488,7 +488,7 @@ def test_query_views_that_are_support_views_too_are_counted(tmp_path, capsys):
         row = json.loads(files[0].read_text())["nearest_view"]
         assert [each.get("query_views_shown", 0) for each in (row, *row["objects"].values())] == [shown] * 2
         assert next(csv.DictReader(io.StringIO(files[2].read_text())))["query_views_shown"] == str(shown or "")
-        said = "1 of 1 objects are judged by query views that the methods were shown, up to 2 of them"
+        said = "1 of 1 object compared on query views that the methods were given, up to 2 views"
         streams = capsys.readouterr()
         assert [said in text for text in (streams.out + streams.err, files[1].read_text())] == [shown > 0] * 2
 
@@ -716,11 +716,15 @@ def test_the_views_that_evaluate_gives_to_methods(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--choose", "random"], "--choose random: expected --support N with it"),
+        (["--choose", "random"], "--choose random: expected --support as well, got none"),
         (["--inputs", "1", "--support", "2"], "--inputs: expected neither --support nor --choose with it"),
         (["--query", "0"], "--query: expected at least 1, got 0"),
         (["--inputs", "999"], "expected inputs from 0 to"),
-        (["--method", "hyperplanes@"], "--method: expected a checkpoint after @, got hyperplanes@"),
+        (["--inputs", "1", "1"], "--inputs: expected different positions of views, from 0, got 1 1"),
+        (["--support", "50", "--choose", "random"], "example-car: expected at least 50 support views to choose"),
+        (["--method", "hyperplanes@"], "--method: expected METHOD@CHECKPOINT, got hyperplanes@"),
+        (["--method", "@small"], "--method: expected METHOD@CHECKPOINT, got @small"),
+        (["--method", "nearest_view@no-{seed}", "--seeds", "2"], "no-0: expected a checkpoint's folder"),
         (["--method", "hyperplanes@smal"], "smal: expected a checkpoint's folder or the name of a packaged model"),
     ],
 )

@@ -200,7 +200,7 @@ class GenerationState:
             return {
                 name: entry
                 for name, entry in self._entries().items()
-                if all(_checksum(self.out, path) == checksum for path, checksum in entry["files"].items())
+                if all(_checksum(self.out, path) == checksum is not None for path, checksum in entry["files"].items())
             }
 
     def _entries(self) -> dict[str, Entry]:

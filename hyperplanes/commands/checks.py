@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hyperplanes.utilities.entry_points import load_entries
+from hyperplanes.utilities.entry_points import find_entries, load_entries
 from hyperplanes.utilities.environment import usable_cores
 
 if TYPE_CHECKING:
@@ -69,8 +69,11 @@ def examine() -> list[Check]:
     checks = [_python(), _torch(), _packages()]
     if all(check.works for check in checks):
         checks += _lookups()
-        for further in load_entries(GROUP).values():
+        found = load_entries(GROUP)
+        for further in found.values():
             checks += further()
+        lost = [entry.name for entry in find_entries(GROUP) if entry.name not in found]
+        checks += [Check(f"checks {name}", False, False, "cannot be imported", "see the warning") for name in lost]
     return [*checks, _disk(Path()), *(_optional(module) for module in OPTIONAL)]
 
 

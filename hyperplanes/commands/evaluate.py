@@ -55,7 +55,7 @@ LARGEST_TABLE = 12  # pairs shown in the terminal; all are in the files
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to compare on what.
+    """The options of `evaluate`.
 
     Attributes:
         data: A data set or one posed scene; example-car comes with the package.
@@ -64,14 +64,14 @@ class Arguments:
             autoencoder; scratch_N (the field of a checkpoint from random weights), nerf_scratch_N,
             multiplane_scratch_N, point_multiplane_scratch_N (no checkpoint is needed); standard, mv_matched,
             mv_shuffled, mv_meta, sv_meta, maml, maml_first_order. All but the first three and hyperplanes_swapped may
-            be followed by _N or _auto for gradient steps. @CHECKPOINT after a name is the checkpoint of this row.
-        checkpoint: The checkpoints of names without @: folders that `train` wrote, folders of them such as runs/demo,
+            be followed by _N or _auto for gradient steps. NAME@CHECKPOINT evaluates that checkpoint.
+        checkpoint: The checkpoints of methods without @: folders that `train` wrote, folders of them such as runs/demo,
             or a packaged model: small, small-paper, cars-64; {seed} stands for each seed.
         json: Write the table here too, with every object, every seed and every pair of methods.
-        csv: Write every object's numbers here, a line each.
+        csv: Write the numbers of every object here, one line each.
         markdown: Write the tables of methods and of their pairs here.
         grid: Draw the truth beside every method's picture here: a view of each of the first objects (PNG, SVG or PDF).
-        boxes: Draw the objects' PSNR here, a box a method.
+        boxes: Draw the PSNR of the objects here, one box per method.
         steps: Evaluate methods after N fine-tuning steps, a row for each number; 0 is the method itself.
         curve: Draw PSNR over --steps into this file.
         fine_tune: What fine-tuning optimises: the weights theta + delta, or the hypernetwork while theta is frozen.
@@ -83,15 +83,15 @@ class Arguments:
             which are then compared although they were given; a warning says so.
         choose: Which views --support takes: the first ones of the data set, those whose cameras are farthest apart, or
             a random choice for each object and seed.
-        inputs: Places of the support views in the order of the views' names, from 0, such as 64 128 for SRN's protocol.
-            All other views are query views.
+        inputs: Positions of the support views in the order of the views' names, from 0, such as 64 128 for SRN's
+            protocol. All other views are query views.
         query: Compare only this number of query views of each object, evenly chosen.
-        preset: The shape of fields that need no checkpoint.
+        preset: The preset of fields that need no checkpoint.
         up: The direction that points up in the data's world: an axis such as y or -z, three numbers such as 0,0.1,1, or
             auto: of a single scene, from how its cameras are held; of a data set, as its files say, otherwise y as in
             training data.
-        protocol: How fields are sampled: as they were trained, 64 + 128 times a ray as in the paper, or by
-            ray marching through what is not empty.
+        protocol: How fields are sampled: default, as in training; paper, 64 + 128 samples on each ray; or
+            ray_marching, which takes samples only in occupied voxels.
         legacy: The principal point of learnit's and the paper's own files is at W / 2 at integer pixel centres.
         device: auto, cpu or cuda.
     """
@@ -178,12 +178,20 @@ def run(arguments: Arguments) -> int:
     sampling = PROTOCOLS[arguments.protocol]
     lpips = None if arguments.lpips is None else LPIPS(arguments.lpips, device)
 
+    chosen = list(dict.fromkeys(row for name in arguments.method for row in rows_of(name, arguments.steps)))
+    named = {
+        (row, seed): find_checkpoints(with_seed([Path(row.partition(AT)[2])], seed))
+        for row in chosen
+        for seed in range(arguments.seeds)
+        if AT in row
+    }
+
     def make(row: str, seed: int) -> WithSampler:
-        name, _, folder = row.partition(AT)
+        name = row.partition(AT)[0]
         objects = _supports(data[seed], names)
         request = Request(
             name,
-            find_checkpoints(with_seed([Path(folder)], seed)) if folder else checkpoints[seed],
+            named.get((row, seed), checkpoints[seed]),
             device=device,
             settings=FineTuning(trainable=arguments.fine_tune, seed=seed),
             objects=objects,
@@ -192,7 +200,6 @@ def run(arguments: Arguments) -> int:
         )
         return WithSampler(make_method(request), sampling)
 
-    chosen = list(dict.fromkeys(row for name in arguments.method for row in rows_of(name, arguments.steps)))
     first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to
     check_fine_tune(arguments.fine_tune, sum(isinstance(made.adapter, FineTuned) for made in first.values()))
     pictures, failures, kept = PictureGrid(), {}, PartialResults(arguments.json)
@@ -249,10 +256,10 @@ def _check(arguments: Arguments) -> None:
     if (fewest := min(arguments.steps, default=0)) < 0:
         raise ValueError(f"--steps: expected 0 or more, got {fewest}")
     for name in arguments.method:
+        if name.startswith(AT) or name.endswith(AT):
+            raise ValueError(f"--method: expected METHOD{AT}CHECKPOINT, got {name}; add what is missing")
         if not rows_of(name, arguments.steps):
             raise ValueError(f"--steps: expected a number of at least 1 for {name}, got 0")
-        if name.endswith(AT):
-            raise ValueError(f"--method: expected a checkpoint after {AT}, got {name}")
     for figure in (arguments.curve, arguments.boxes, arguments.grid):
         if figure is not None:
             figure_kind(figure)  # a wrong name is found before anything is evaluated
@@ -262,9 +269,13 @@ def _check(arguments: Arguments) -> None:
         if (number := getattr(arguments, option)) is not None and number < 1:
             raise ValueError(f"--{option}: expected at least 1, got {number}")
     if arguments.inputs and (arguments.support is not None or arguments.choose != "first"):
-        raise ValueError("--inputs: expected neither --support nor --choose with it, as it states the support views")
+        given = "--choose" if arguments.support is None else "--support"
+        raise ValueError(f"--inputs: expected neither --support nor --choose with it, got {given}; leave one out")
+    if arguments.inputs and (min(arguments.inputs) < 0 or len(set(arguments.inputs)) < len(arguments.inputs)):
+        found = " ".join(map(str, arguments.inputs))
+        raise ValueError(f"--inputs: expected different positions of views, from 0, got {found}")
     if arguments.support is None and arguments.choose != "first":
-        raise ValueError(f"--choose {arguments.choose}: expected --support N with it, got none")
+        raise ValueError(f"--choose {arguments.choose}: expected --support as well, got none; add a number of views")
 
 
 def _tasks(arguments: Arguments, opened: Dataset, seed: int) -> Tasks:
@@ -317,8 +328,8 @@ def _of_shown(scores: Sequence[Score]) -> str:
     if not shown:
         return ""
     return (
-        f"{len(shown)} of {len(scores[0].objects)} objects are judged by query views that the methods were shown, up "
-        f"to {max(shown)} of them, which --support takes: this is not the quality of new views"
+        f"{len(shown)} of {counted(len(scores[0].objects), 'object')} compared on query views that the methods were "
+        f"given, up to {counted(max(shown), 'view')}: this is not the quality of new views"
     )
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hyperplanes.commands.console import Console
     from hyperplanes.views import Task, Views
 
-__all__ = ["refine_task"]
+__all__ = ["check_support", "refine_task"]
 
 COMPARED_SIZE = 128  # pixels along the longer side of the support views when poses are compared
 LEAST_GAIN = 0.5  # dB: four held-out views cannot measure less, and refining makes correct poses slightly worse
@@ -36,22 +36,15 @@ def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views:
         all_views: whether support and query views are the same.
 
     Returns:
-        The task.
-
-    Raises:
-        ValueError: too few views, in all or as support.
+        The task; a ValueError if there are too few views, in all or as support.
     """
     from hyperplanes.adaptation.kept import keep_tensors, kept_file, recall_tensors
-    from hyperplanes.evaluation.suitability import FEWEST_VIEWS, HELD_OUT_SIZE
+    from hyperplanes.evaluation.suitability import HELD_OUT_SIZE
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.views import Task, join_views
 
+    check_support(task)
     count, started = len(task.support), time.perf_counter()
-    if count < FEWEST_VIEWS:
-        raise ValueError(
-            f"--refine-poses: expected at least {FEWEST_VIEWS} support views to compare refined poses with the given "
-            f"ones, got {count}"
-        )
     views = task.support if all_views else join_views(task.support, task.query)
     file = kept_file("poses", views, source, count)
     found = recall_tensors(file, ("extrinsics", "turned", "psnr"))
@@ -74,6 +67,21 @@ def refine_task(source: HyperPlanes, task: Task, console: Console, *, all_views:
     views = views.to("cpu", found["extrinsics"].dtype)
     views = replace(views, cameras=camera.with_poses(views.cameras, found["extrinsics"]))
     return Task(views[:count], views if all_views else views[count:], task.name)
+
+
+def check_support(task: Task) -> None:
+    """Require enough support views to compare refined poses with the given ones.
+
+    Raises:
+        ValueError: fewer.
+    """
+    from hyperplanes.evaluation.suitability import FEWEST_VIEWS
+
+    if len(task.support) < FEWEST_VIEWS:
+        raise ValueError(
+            f"--refine-poses: expected at least {FEWEST_VIEWS} support views to compare refined poses with the given "
+            f"ones, got {len(task.support)}; add views, or --all-views"
+        )
 
 
 def _refined(source: HyperPlanes, views: Views, count: int, console: Console) -> dict[str, Tensor]:

@@ -73,7 +73,7 @@ class Arguments(ObjectArguments):
             both see. This renders all support views first. auto: as the model is configured; `small` does so with at
             least 10 views that are not large.
         protocol: How the field is sampled: default, as in training; paper, 64 + 128 samples on each ray; or
-            ray_marching, which takes samples only in the visual hull.
+            ray_marching, which takes samples only in occupied voxels.
     """
 
     fine_tune: Free = "weights"

@@ -56,8 +56,10 @@ def prepare_task(
     """
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.background import cut_out_task
-    from hyperplanes.commands.poses import refine_task
+    from hyperplanes.commands.poses import check_support, refine_task
 
+    if arguments.refine_poses:
+        check_support(task)
     if arguments.learn_background:
         task = cut_out_task(task, console, all_views=all_views)
     if arguments.refine_poses:

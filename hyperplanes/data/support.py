@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -40,9 +40,15 @@ class WithSupport(TaskWrapper):
     def __post_init__(self) -> None:
         if self.count < 1:
             raise ValueError(f"support: expected at least 1 view, got {self.count}")
+        if self.choose not in get_args(Choice):
+            raise ValueError(f"choose: expected one of {', '.join(get_args(Choice))}, got {self.choose!r}")
 
     def change(self, task: Task) -> Task:
-        """The task with `count` support views; raises ValueError if the object has fewer views in total."""
+        """The task with `count` support views.
+
+        Raises:
+            ValueError: the object has fewer views in total, or fewer support views and these are to be chosen.
+        """
         total = len(task.support) + len(task.query)
         if self.count > total:
             raise ValueError(
@@ -50,6 +56,11 @@ class WithSupport(TaskWrapper):
                 f"--support {total} takes all of them"
             )
         more = self.count - len(task.support)
+        if more > 0 and self.choose != "first":
+            raise ValueError(
+                f"{task.name}: expected at least {self.count} support views to choose from, got {len(task.support)}; "
+                "choose fewer, or the first ones"
+            )
         support = task.support[self._chosen(task)] if more <= 0 else join_views(task.support, task.query[:more])
         return replace(task, support=support)
 
@@ -143,12 +154,18 @@ class Inputs(TaskWrapper):
 
     places: tuple[int, ...]
 
+    def __post_init__(self) -> None:
+        if not self.places or min(self.places) < 0 or len(set(self.places)) < len(self.places):
+            found = " ".join(map(str, self.places)) or "none"
+            raise ValueError(f"inputs: expected different positions of views, from 0, got {found}")
+
     def change(self, task: Task) -> Task:
         """The task with these support views; raises ValueError if the object has no such view."""
         views = join_views(task.support, task.query)
         order = sorted(range(len(views)), key=lambda index: views.names[index]) if views.names else range(len(views))
-        if not all(0 <= place < len(views) for place in self.places):
-            raise ValueError(f"{task.name}: expected inputs from 0 to {len(views) - 1}, got {self.places}")
+        if max(self.places) >= len(views):
+            found = " ".join(map(str, self.places))
+            raise ValueError(f"{task.name}: expected inputs from 0 to {len(views) - 1}, got {found}; name other views")
         inputs = [order[place] for place in self.places]
         rest = [index for index in order if index not in inputs]
         return replace(task, support=views[inputs], query=views[rest])

@@ -245,7 +245,7 @@ def evaluate_all(
 
     Args:
         methods: by the names of their rows, functions that make a method from a seed.
-        data: the data set; or a sequence of data sets, one a seed, such as with other choices of support views.
+        data: the data set; or a sequence of data sets, one per seed, such as with other choices of support views.
         names: the objects.
         report: called after each evaluation with the number of evaluations done, their total, and a line of text.
         seeds: the number of seeds, from 0.
@@ -257,11 +257,15 @@ def evaluate_all(
 
     Returns:
         The scores in the order of the methods, on the objects on which none of these methods failed. Methods that
-        failed on every object are left out. ValueError if no common object is left; if everything failed, the first
-        error is raised.
+        failed on every object are left out. If everything failed, the first error is raised.
+
+    Raises:
+        ValueError: no common object is left, or another number of data sets than of seeds.
     """
     done, found, errors = 0, {}, []
     by_seed = data if isinstance(data, Sequence) else [data] * seeds
+    if len(by_seed) != seeds:
+        raise ValueError(f"data: expected a data set for each of {seeds} seeds, got {len(by_seed)}")
 
     def failed(method: str, seed: int, name: str, error: Exception) -> None:
         nonlocal done

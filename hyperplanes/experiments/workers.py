@@ -72,9 +72,8 @@ class Workers:
             for child in children:
                 child.terminate()  # does nothing to a process that has ended
             until = time.monotonic() + SAVING
-            for (
-                child
-            ) in children:  # a process may wait forever for the lock of the pool's queue if another died with it
+            # a process may wait forever for the lock of the pool's queue if another died with it
+            for child in children:
                 child.join(max(0.0, until - time.monotonic()))
                 child.kill()
         self._pool.shutdown()

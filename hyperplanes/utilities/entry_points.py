@@ -23,20 +23,8 @@ def load_entries(group: str, own: Collection[str] = ()) -> dict[str, Any]:
         The objects by name; each is imported once. One that cannot be imported is left out, with a warning that names
         its package, so that a broken package does not stop commands that do not need it.
     """
-    loaded = {}
-    for entry in find_entries(group):
-        if entry.name in own:
-            continue
-        try:
-            loaded[entry.name] = _load(entry)
-        except Exception as error:  # importing another package can raise anything
-            package = entry.dist.name if entry.dist else entry.value
-            warnings.warn(
-                f"{package}: {entry.name!r} of {entry.group} is left out, {entry.value} cannot be imported "
-                f"({type(error).__name__}: {error}); update or remove that package",
-                stacklevel=2,
-            )
-    return loaded
+    loaded = {entry.name: _load(entry) for entry in find_entries(group) if entry.name not in own}
+    return {name: value for name, value in loaded.items() if value is not None}
 
 
 def find_entries(group: str) -> tuple[EntryPoint, ...]:
@@ -51,4 +39,15 @@ def _find_entries(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
 
 @cache
 def _load(entry: EntryPoint) -> Any:
-    return entry.load()
+    """The object that an entry point names; None, with a warning, if it cannot be imported."""
+    try:
+        return entry.load()
+    except Exception as error:  # importing another package can raise anything
+        package = entry.dist.name if entry.dist else entry.value
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        warnings.warn(
+            f"{package}: {entry.name!r} of {entry.group} is left out, {entry.value} cannot be imported ({reason}); "
+            "update or remove that package",
+            stacklevel=3,
+        )
+        return None

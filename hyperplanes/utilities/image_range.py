@@ -34,5 +34,5 @@ def check_image_range(name: str, values: object) -> None:
         return
     low, high = (float(value) for value in values.detach().aminmax())
     if not (1 - MOST <= low and high <= MOST):
-        hint = "divide 8-bit pixels by 255"
-        raise ValueError(f"{name}: expected finite numbers in [0, 1], got {low:g} to {high:g}; {hint}")
+        found = f"{low:g} to {high:g}; divide 8-bit pixels by 255" if low == low else "NaN"
+        raise ValueError(f"{name}: expected finite numbers in [0, 1], got {found}")

@@ -18,7 +18,7 @@ def psnr(
 ) -> Float[Tensor, " view"]:
     """Peak signal-to-noise ratio in dB of each image, both in [0, 1]: -10 log10 of the mean squared error.
 
-    Equal images give infinity. Images of different shapes, or a truth outside [0, 1], are a ValueError.
+    Equal images give infinity. Images of different shapes, or a truth far outside [0, 1], are a ValueError.
 
     >>> psnr(torch.full((1, 3, 4, 4), 0.6), torch.full((1, 3, 4, 4), 0.5)).round().tolist()
     [20.0]
@@ -33,7 +33,7 @@ def pooled_psnr(
 ) -> Float[Tensor, ""]:
     """PSNR in dB of the squared error of all images together; never above the mean of `psnr`.
 
-    Images of different shapes, or a truth outside [0, 1], are a ValueError.
+    Images of different shapes, or a truth far outside [0, 1], are a ValueError.
 
     >>> truth = torch.zeros(2, 3, 4, 4)
     >>> round(pooled_psnr(truth + torch.tensor([0.1, 0.0]).view(2, 1, 1, 1), truth).item(), 2)
@@ -54,7 +54,7 @@ def foreground_psnr(
     White background does not count, so the value does not depend on its area.
 
     Raises:
-        ValueError: images of different shapes, a truth outside [0, 1], or masks of another size or number.
+        ValueError: images of different shapes, a truth far outside [0, 1], or masks of another size or number.
 
     >>> truth, masks = torch.zeros(1, 3, 2, 2), torch.tensor([[[[1.0, 0.0], [0.0, 0.0]]]])
     >>> foreground_psnr(truth + torch.tensor([[0.1, 1.0], [1.0, 1.0]]), truth, masks).round(decimals=2).tolist()
@@ -78,7 +78,7 @@ def ssim(
     Equals scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)`.
 
     Raises:
-        ValueError: images of different shapes or smaller than the window, or a truth outside [0, 1].
+        ValueError: images of different shapes or smaller than the window, or a truth far outside [0, 1].
     """
     from kornia.metrics import ssim as kornia_ssim
 
@@ -94,4 +94,4 @@ def _check(predicted: Tensor, truth: Tensor) -> None:
         raise ValueError(
             f"predicted: expected the shape of the truth, {tuple(truth.shape)}, got {tuple(predicted.shape)}"
         )
-    check_image_range("truth", truth.nan_to_num())  # NaN gives a score of NaN
+    check_image_range("truth", truth.nan_to_num(posinf=torch.inf, neginf=-torch.inf))  # NaN gives a score of NaN

@@ -129,7 +129,7 @@ def test_one_picture_for_many_poses_is_found(scene):
     assert check_duplicates(views) is None
     names = tuple(f"{index}.png" for index in range(12))
     repeated = replace(views, images=views.images[[0, 1, 2, 0, 0, 5, 6, 7, 8, 9, 10, 0]], names=names)
-    assert "4 of 12 poses have the picture of another pose (0.png and 3.png" in check_duplicates(repeated)
+    assert "4 of 12 poses have the image of another pose (0.png and 3.png" in check_duplicates(repeated)
     assert check_duplicates(views[[0, 0, 1]]) is None  # the same view twice is consistent
 
 
@@ -140,7 +140,7 @@ def test_one_picture_in_support_and_query_is_found(scene, tmp_path):
     document["frames"].append(document["frames"][5])
     (home / "transforms.json").write_text(json.dumps(document))
     found = describe(home).lines()
-    assert any("2 of 8 poses have the picture of another pose (images/000.png and images/003.png" in s for s in found)
+    assert any("2 of 8 poses have the image of another pose (images/000.png and images/003.png" in s for s in found)
     assert f"{home.name}: 1 frame left out, whose images earlier frames list: images/005.png" in found
 
 

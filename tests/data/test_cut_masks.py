@@ -64,6 +64,9 @@ def test_single_masks_of_the_background_are_found_if_the_others_show_the_object_
     holed[0] = 1.0
     holed[0, :, 20:24, 20:24] = 0.0
     assert not inverted(holed).any()
+    full = torch.cat([whole, torch.ones_like(whole[:1])])  # one close-up, with a single transparent pixel
+    full[-1, :, 20, 20] = 0.0
+    assert not inverted(full).any()
 
 
 @pytest.mark.parametrize("has_alpha", [True, False])

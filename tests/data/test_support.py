@@ -95,8 +95,11 @@ def test_inputs_are_numbered_in_the_order_of_their_names(named):
     for got, (views, place) in zip(after.support.images, expected, strict=True):
         assert torch.equal(got, views.images[place])
     assert len(after.query) == 6
-    with pytest.raises(ValueError, match="test0: expected inputs from 0 to 7, got"):
+    with pytest.raises(ValueError, match="test0: expected inputs from 0 to 7, got 8; name other views"):
         Inputs(Alternating(), (8,)).task("test0")
+    for wrong in ((), (1, 1), (-1,)):
+        with pytest.raises(ValueError, match="inputs: expected different positions of views, from 0, got"):
+            Inputs(Alternating(), wrong)
 
 
 def test_the_support_can_be_the_views_that_are_farthest_apart():
@@ -120,8 +123,10 @@ def test_random_support_views_are_distinct_and_depend_on_the_seed_and_the_object
     assert all(len(set(draw)) == 4 for draw in draws)
     assert {index for draw in draws for index in draw} == set(range(12)), "40 draws of 4 in 12 miss one by 12 (2/3)^40"
     assert drawn("test0", 0) != drawn("test1", 0)
-    whole = WithSupport(data, 14, "random").task("test0").support
-    assert torch.equal(whole.images, WithSupport(data, 14).task("test0").support.images)
+    with pytest.raises(ValueError, match="test0: expected at least 14 support views to choose from, got 12"):
+        WithSupport(data, 14, "random").task("test0")
+    with pytest.raises(ValueError, match="choose: expected one of first, farthest, random, got 'furthest'"):
+        WithSupport(data, 3, "furthest")
 
 
 def test_query_views_are_left_out_evenly():

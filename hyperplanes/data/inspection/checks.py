@@ -30,19 +30,19 @@ def check_duplicates(views: Views) -> str | None:
         return None
     count, largest = sum(map(len, groups)), max(groups, key=len)
     return (
-        f"pictures: WRONG, {count} of {len(views)} poses have the picture of another pose ({names[largest[0]]} and "
-        f"{names[largest[1]]} are the same, {len(largest)} times in all); give every pose its own picture"
+        f"images: WRONG, {count} of {len(views)} poses have the image of another pose ({names[largest[0]]} and "
+        f"{names[largest[1]]} are the same, {len(largest)} times in all); give every pose its own image"
     )
 
 
 def check_poses(views: Views) -> str | None:
     """A sentence where more than half of three or more views have one and the same pose, otherwise None."""
     pose = camera.camera_from_world(views.cameras).reshape(len(views), -1)
-    same = int(((pose[:, None] - pose).abs().amax(-1) < SAME).sum(1).max())
+    same = int((torch.cdist(pose, pose, p=torch.inf) < SAME).sum(1).max())
     if len(views) < 3 or 2 * same <= len(views):
         return None
     return (
-        f"poses: WRONG, {same} of {len(views)} are the same; give every picture the pose of the camera relative to the "
+        f"poses: WRONG, {same} of {len(views)} are the same; give every image the pose of the camera relative to the "
         "object (on a turntable, the camera moves around the object)"
     )
 

@@ -125,7 +125,7 @@ class SceneReport:
         if self.sparse is not None:
             lines.append(_sparse_line(self.sparse))
         if cut := sum(view.cut for view in self.views):
-            lines.append(f"cut off: {cut} of {len(self.views)} pictures do not show the object whole")
+            lines.append(f"cut off: {cut} of {len(self.views)} images do not show the object whole")
         said = [f"{view.name} ({', '.join(view.faults)})" for view in self.worst if view.faults]
         if not said and (least := self.worst[0]).agreement is not None:
             said = [f"none stands out; the mask of {least.name} fits the hull of all least, by {least.agreement:.0%}"]
@@ -184,13 +184,14 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
     sharp = _sharpness(views, apart)
     cut = cut_off(views.masks) if views.masks is not None else torch.zeros(len(views), dtype=torch.bool)
     background = inverted(views.masks) if views.masks is not None else torch.zeros_like(cut)
+    cut &= ~background
     errors: Mapping[str, float] = {} if sparse is None else sparse.errors
     usual = median(errors.values()) if errors else None
     reports = []
     for index, name in enumerate(names):
         fit = None if agreement is None else float(agreement[index])
         faults = ["the mask seems to show the background"] if background[index] else []
-        if fit is not None and middle is not None and fit < middle - UNLIKE:
+        if not background[index] and fit is not None and middle is not None and fit < middle - UNLIKE:
             faults.append(f"mask and the hull of all masks agree by {fit:.0%}, in the median {middle:.0%}")
         if float(sharp[index]) < BLURRED:
             faults.append(f"blurred, {float(sharp[index]):.0%} as sharp as the views beside it")

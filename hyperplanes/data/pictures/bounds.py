@@ -35,6 +35,7 @@ FEWEST_MASKS = 3
 MOST_MASKS = 24  # views used: the hull of fewer views is only larger
 LARGEST_MASK = 256
 BORDER = 0.9  # of the pixels at the image border, which an inverted mask covers at least
+SMALLEST = 0.01  # least share of an image that an object covers, for its mask to be recognised as inverted
 OFTEN_CUT = 0.1  # of the masks: a larger share at the border of their image counts as a scene of close-ups
 ROOM = 3.0  # radii of the sphere from the cameras: where the hull of such a scene is searched
 WHOLE, SHOWN = 0.9, 0.25  # of the images that show the object whole, or of all images, that must show a point
@@ -109,7 +110,7 @@ def inverted(
     """
     opaque = masks[:, 0] > (127 if masks.dtype == torch.uint8 else 0.5)
     border = torch.cat([opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]], -1).float().mean(-1)
-    found = (border > BORDER) & (opaque.flatten(1).float().mean(-1) < border)
+    found = (border > BORDER) & (opaque.flatten(1).float().mean(-1) < border - SMALLEST)
     most = 2 * int(found.sum()) > len(masks)
     if most or (found.any() and 2 * int(cut_off(masks[~found]).sum()) < int((~found).sum())):
         return found
