@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import NearestView, Pictures
-from hyperplanes.evaluation import ObjectScore, Score, evaluate
+from hyperplanes.data.support import WithSupport
+from hyperplanes.evaluation import ObjectScore, Score, evaluate, evaluate_all
 from hyperplanes.evaluation.figures import PictureGrid
 from hyperplanes.evaluation.suitability import suitability_warnings, worse_than_copying
 from hyperplanes.evaluation.tables import rows
@@ -155,6 +156,18 @@ def test_seeds_of_a_perfect_row_have_no_deviation():
     assert row.deviation("psnr") is None
     assert row.deviation("ssim") == 0
     assert "inf" in headings_and_rows(row)
+
+
+def test_each_seed_may_have_its_own_tasks():
+    data = Balls(test=1, views=6)
+    chosen = [WithSupport(data, 2, "random", seed) for seed in range(2)]
+    methods = {"nearest_view": lambda seed: NearestView()}
+    (row,) = evaluate_all(methods, chosen, ["test0"], lambda *_: None, seeds=2)
+    expected = [evaluate("nearest_view", NearestView(), tasks, ["test0"]).mean("psnr") for tasks in chosen]
+    assert [run.mean("psnr") for run in row.seeds] == expected
+    assert expected[0] != expected[1]
+    with pytest.raises(ValueError, match="data: expected a data set for each of 3 seeds, got 2"):
+        evaluate_all(methods, chosen, ["test0"], lambda *_: None, seeds=3)
 
 
 def headings_and_rows(row):
