@@ -156,6 +156,7 @@ def test_seeds_of_a_perfect_row_have_no_deviation():
     assert row.deviation("psnr") is None
     assert row.deviation("ssim") == 0
     assert "inf" in headings_and_rows(row)
+    assert rows([row])[0][2] == "-", "one object has no deviation over objects"
 
 
 def test_each_seed_may_have_its_own_tasks():
