@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from hyperplanes.adaptation.hub import download_checkpoint, is_repository
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
+from hyperplanes.utilities.errors import did_you_mean
 from hyperplanes.utilities.writing import write_json
 
 __all__ = [
@@ -89,8 +90,8 @@ def checkpoint_folder(name: Path | str) -> Path:
     if folder.name not in packaged:
         known = ", ".join(packaged) or "this installation has none"
         raise CheckpointError(
-            f"{name}: expected a checkpoint's folder or the name of a packaged model ({known}), found neither; "
-            "`hyperplanes train` writes a checkpoint"
+            f"{name}: expected a checkpoint's folder or the name of a packaged model ({known}), found neither"
+            + (did_you_mean(folder.name, packaged) or "; `hyperplanes train` writes a checkpoint")
         )
     return packaged_folder(folder.name)
 

@@ -329,8 +329,10 @@ def test_a_packaged_model_is_found_by_its_name(model, tmp_path, monkeypatch):
     model.save(tmp_path / "package" / "cars-8")
     found = HyperPlanes.from_pretrained("cars-8")
     assert all(torch.equal(value, found.state_dict()[name]) for name, value in model.state_dict().items())
-    with pytest.raises(CheckpointError, match=r"boats-8: expected .* packaged model \(cars-8\), found neither; "):
-        HyperPlanes.from_pretrained("boats-8")
+    with pytest.raises(CheckpointError, match=r"boats: expected .* packaged model \(cars-8\), found neither; `hyper"):
+        HyperPlanes.from_pretrained("boats")
+    with pytest.raises(CheckpointError, match=r"car-8: expected .*, found neither; did you mean cars-8\?"):
+        HyperPlanes.from_pretrained("car-8")
     with pytest.raises(CheckpointError, match="runs/boats-8: expected a checkpoint's folder, found no such folder"):
         HyperPlanes.from_pretrained("runs/boats-8")  # a path is not looked up among the packaged models
 
