@@ -115,7 +115,7 @@ def test_the_benchmark_of_views_fine_tunes_only_on_two_views_or_more(tmp_path):
         (["views", "--data", "DATA", "--counts", "3", "0"], "--counts: expected a whole number of at least 1, got '0'"),
         (["views", "--data", "DATA", "--counts", "1", "--inputs", "1"], "--counts, --inputs: expected one of the two"),
         (["views", "--data", "DATA", "--counts", "100"], "data: expected 100 views to show, found 9; choose smaller"),
-        (["views", "--data", "DATA", "--inputs", "99"], "expected inputs from 0 to 11, got (99,)"),
+        (["views", "--data", "DATA", "--inputs", "99"], "expected inputs from 0 to 11, got 99; name other views"),
     ],
 )
 def test_wrong_input_is_reported_in_one_line(words, expected, tmp_path, monkeypatch, capsys):

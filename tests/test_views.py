@@ -234,7 +234,7 @@ def test_the_size_of_the_cameras_determines_which_dimension_is_which(size):
             "expected finite numbers in .0, 1., got 0 to 255; divide 8-bit pixels",
         ),
         (lambda images: (images * 255).to(torch.uint8), "got a tensor of uint8, shape .*/ 255 converts 8-bit"),
-        (lambda images: images * float("nan"), "expected finite numbers in .0, 1., got nan"),
+        (lambda images: images * float("nan"), "expected finite numbers in .0, 1., got NaN"),
         (lambda images: images > 0.5, r"got a tensor of bool, shape .*; x.float\(\) converts booleans"),
         (lambda images: images.numpy(), "got a numpy.ndarray; torch.from_numpy"),
         (lambda images: None, "got None"),
