@@ -755,6 +755,12 @@ def test_seeds_of_trainings_and_of_gradient_steps_in_every_kind_of_file(tmp_path
         alone = ["--checkpoint", str(tmp_path / f"run-{seed}"), "--method", "hyperplanes"]
         assert main(["evaluate", *data, *alone, "--json", str(tmp_path / "one.json")]) == 0
         single.append(json.loads((tmp_path / "one.json").read_text())["hyperplanes"]["psnr"])
+    absent = ["--method", "nearest_view", f"hyperplanes@{tmp_path / 'run-{seed}'}", "--seeds", "3"]
+    capsys.readouterr()
+    assert main(["evaluate", *data, *absent]) == 2, "found before the first seed is evaluated"
+    printed = capsys.readouterr()
+    assert "run-2: expected a checkpoint, found no such folder" in printed.err
+    assert "nearest_view" not in printed.out + printed.err
     both = [f"hyperplanes@{tmp_path / run}" for run in ("run-0", "run-1")]
     assert main(["evaluate", *data, "--method", *both, "--json", str(tmp_path / "both.json")]) == 0
     side_by_side = json.loads((tmp_path / "both.json").read_text())
@@ -1118,7 +1124,7 @@ def test_a_missing_package_is_named_in_one_line(monkeypatch, capsys):
 def test_warnings_of_commands_are_one_line_without_a_place_in_the_code():
     script = (
         "import sys, warnings, hyperplanes.cli as cli\n"
-        "cli._main = lambda arguments: warnings.warn('check cx') or warnings.warn('old', FutureWarning) or 0\n"
+        "cli._main = lambda arguments: warnings.warn('check\\n  cx') or warnings.warn('old', FutureWarning) or 0\n"
         "sys.exit(cli.main([]))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -271,9 +271,6 @@ def _check(arguments: Arguments) -> None:
     if arguments.inputs and (arguments.support is not None or arguments.choose != "first"):
         given = "--choose" if arguments.support is None else "--support"
         raise ValueError(f"--inputs: expected neither --support nor --choose with it, got {given}; leave one out")
-    if arguments.inputs and (min(arguments.inputs) < 0 or len(set(arguments.inputs)) < len(arguments.inputs)):
-        found = " ".join(map(str, arguments.inputs))
-        raise ValueError(f"--inputs: expected different positions of views, from 0, got {found}")
     if arguments.support is None and arguments.choose != "first":
         raise ValueError(f"--choose {arguments.choose}: expected --support as well, got none; add a number of views")
 
@@ -281,10 +278,12 @@ def _check(arguments: Arguments) -> None:
 def _tasks(arguments: Arguments, opened: Dataset, seed: int) -> Tasks:
     """The objects with the requested support and query views."""
     from hyperplanes.data.support import FewerQueries, Inputs, WithSupport
+    from hyperplanes.utilities.errors import rename_errors
 
     tasks: Tasks = opened
     if arguments.inputs:
-        tasks = Inputs(opened, arguments.inputs)
+        with rename_errors("inputs", "--inputs"):
+            tasks = Inputs(opened, arguments.inputs)
     elif arguments.support is not None:
         tasks = WithSupport(opened, arguments.support, arguments.choose, seed)
     return tasks if arguments.query is None else FewerQueries(tasks, arguments.query)

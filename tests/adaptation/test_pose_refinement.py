@@ -5,6 +5,7 @@ Source of truth: the poses from which the images of example-car were rendered, p
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,8 +13,10 @@ import torch
 from hyperplanes.adaptation import pose_refinement
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.pose_refinement import refine_poses
+from hyperplanes.commands import background
 from hyperplanes.commands import poses as command
 from hyperplanes.commands.console import Console
+from hyperplanes.commands.scene import prepare_task
 from hyperplanes.data import read_task
 from hyperplanes.data.inspection.matches import sampson
 from hyperplanes.geometry import cameras as camera
@@ -121,3 +124,7 @@ def test_too_few_support_views_to_compare_poses_are_refused_before_poses_are_ref
     task = Task(views[:3], views[3:], "car")
     with pytest.raises(ValueError, match="--refine-poses: expected at least 4 support views .*, got 3"):
         command.refine_task(HyperPlanes.from_pretrained("cars-64"), task, Console())
+    monkeypatch.setattr(background, "cut_out_task", None)  # which takes minutes, is not begun
+    both = SimpleNamespace(refine_poses=True, learn_background=True)
+    with pytest.raises(ValueError, match="--refine-poses: expected at least 4 support views"):
+        prepare_task(both, task, HyperPlanes.from_pretrained("cars-64"), Console(), all_views=False)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_masks, check_poses, check_splits
 from hyperplanes.data.inspection.conventions import check_conventions
@@ -142,6 +143,27 @@ def test_one_picture_in_support_and_query_is_found(scene, tmp_path):
     found = describe(home).lines()
     assert any("2 of 8 poses have the image of another pose (images/000.png and images/003.png" in s for s in found)
     assert f"{home.name}: 1 frame left out, whose images earlier frames list: images/005.png" in found
+
+
+def test_equal_poses_and_inverted_masks_are_problems_of_a_described_scene(scene, tmp_path):
+    document, home = scene.document(), scene.write(tmp_path)
+    assert describe(home).objects[0].consistent
+    right = [frame["transform_matrix"] for frame in document["frames"]]
+    for frame in document["frames"]:
+        frame["transform_matrix"] = right[0]
+    (home / "transforms.json").write_text(json.dumps(document))
+    assert any("poses: WRONG, 8 of 8 are the same" in line for line in describe(home).objects[0].problems)
+    for frame, pose in zip(document["frames"], right, strict=True):
+        frame["transform_matrix"] = pose
+    (home / "transforms.json").write_text(json.dumps(document))
+    pixels = np.array(Image.open(home / scene.names[1]))
+    pixels[..., 3] = 255 - pixels[..., 3]
+    Image.fromarray(pixels).save(home / scene.names[1])
+    described = describe(home)
+    assert not described.broken
+    found = described.objects[0]
+    assert "masks: WRONG, 1 of 8 seem to show the background" in found.problems
+    assert not found.consistent
 
 
 def test_splits_with_different_world_coordinates_are_found(scene):

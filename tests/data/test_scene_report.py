@@ -62,7 +62,8 @@ def test_masks_of_the_background_are_reported_as_inverted():
     one[3] = 1 - one[3]
     report = describe_scene(replace(views, masks=one))
     assert report.expectation().startswith("poor pictures: 1 of 12 masks")
-    assert "the mask seems to show the background" in report.views[3].faults
+    assert report.views[3].faults == ("the mask seems to show the background",)
+    assert not any(view.cut for view in report.views), "an inverted mask does not say that the object is cut off"
     assert [view.name for view in report.views if view.faults] == [report.views[3].name]
 
 

@@ -89,7 +89,9 @@ def estimate_bounds(
     return sphere
 
 
-def cut_off(masks: Float[Tensor, "view 1 height width"]) -> Bool[Tensor, " view"]:
+def cut_off(
+    masks: Float[Tensor, "view 1 height width"] | UInt8[Tensor, "view 1 height width"],
+) -> Bool[Tensor, " view"]:
     """Which masks reach the border of their image.
 
     A single pixel that is hardly opaque suffices, because a view that counts as showing the object whole limits the
