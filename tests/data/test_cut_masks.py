@@ -62,7 +62,7 @@ def test_single_masks_of_the_background_are_found_if_the_others_show_the_object_
     assert inverted(mixed).nonzero()[:, 0].tolist() == some.tolist()
     holed = masks[masks.flatten(1).mean(1) > 0.8].clone()  # close-ups, of which one shows the background through a hole
     holed[0] = 1.0
-    holed[0, :, 20:24, 20:24] = 0.0
+    holed[0, :, 16:32, 16:32] = 0.0
     assert not inverted(holed).any()
     full = torch.cat([whole, torch.ones_like(whole[:1])])  # one close-up, with a single transparent pixel
     full[-1, :, 20, 20] = 0.0
