@@ -9,7 +9,7 @@ import sys
 from importlib import import_module
 
 from benchmarks.load import LIMIT, OF_SPEED, load_at_start
-from hyperplanes.utilities.errors import one_line, wants_traceback
+from hyperplanes.utilities.messages.errors import one_line, wants_traceback
 
 NAMES = (
     "adapting",

@@ -16,7 +16,7 @@ from unittest.mock import patch
 import torch
 
 from hyperplanes.data.devices import choose_device
-from hyperplanes.utilities.timing import clock
+from hyperplanes.utilities.machine.timing import clock
 
 __all__ = [
     "Times",

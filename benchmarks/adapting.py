@@ -27,7 +27,7 @@ from hyperplanes.data import read_task
 from hyperplanes.export.animation import fitted_voxels
 from hyperplanes.export.baking import BakedScene, default_side
 from hyperplanes.export.voxel_fitting import STEPS
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task, Views
 
 __all__ = ["main"]

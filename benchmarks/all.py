@@ -25,7 +25,7 @@ import torch
 from benchmarks import tables
 from benchmarks.load import OF_SPEED
 from benchmarks.options import positive
-from hyperplanes.utilities.environment import usable_cores
+from hyperplanes.utilities.machine.environment import usable_cores
 
 __all__ = ["COMMANDS", "OF_DATA", "OF_GPU", "OF_SUITES", "main"]
 

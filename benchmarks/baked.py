@@ -25,7 +25,7 @@ from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
 from hyperplanes.export.baking import BakedScene, bake, default_side
 from hyperplanes.export.voxel_fitting import STEPS, fit_voxels, render_guide
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task
 
 __all__ = ["main"]

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 from benchmarks._timing import ratio
 from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
-from hyperplanes.utilities.environment import usable_cores
+from hyperplanes.utilities.machine.environment import usable_cores
 
 if TYPE_CHECKING:
     from hyperplanes.adaptation import HyperPlanes

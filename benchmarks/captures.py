@@ -38,28 +38,28 @@ from benchmarks.reporting import Row, finish, write_rows
 from benchmarks.staged_photographs import Staged, stage, walk_around
 from data_gen.meshes.find import find_meshes
 from data_gen.meshes.mesh import load_mesh
-from hyperplanes.adaptation.background import separate_background
 from hyperplanes.adaptation.base import Adapter
+from hyperplanes.adaptation.baselines.nearest_view import NearestView
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.capture import Settings, capture
 from hyperplanes.capture.masks import consistency
+from hyperplanes.capture.masks.background import separate_background
 from hyperplanes.capture.masks.consistency import agree
 from hyperplanes.capture.pipeline import ROOM
 from hyperplanes.capture.placement import object_points, object_sphere
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages, fingerprint
 from hyperplanes.data import read_task
-from hyperplanes.data.formats.transforms_document import transforms_document
+from hyperplanes.data.formats.scenes.transforms_document import transforms_document
 from hyperplanes.data.pictures.images import Pixels, composite_over_white, read_image
 from hyperplanes.data.pictures.undistort import undistort
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.environment import find_commit
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.metrics import psnr
-from hyperplanes.utilities.writing import write_json, write_whole
+from hyperplanes.utilities.files.encoding import encode_png
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.files.writing import write_json, write_whole
+from hyperplanes.utilities.images.metrics import psnr
+from hyperplanes.utilities.machine.environment import find_commit
 from hyperplanes.views import Views
 
 __all__ = ["PoseErrors", "compare_poses", "damaged_masks", "main"]

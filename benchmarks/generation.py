@@ -29,7 +29,7 @@ from benchmarks._timing import ratio
 from benchmarks.generation_loop import RESOLUTION, VIEWS
 from benchmarks.reporting import Row, finish
 from data_gen import SUPERSAMPLE
-from hyperplanes.utilities.environment import usable_cores
+from hyperplanes.utilities.machine.environment import usable_cores
 
 __all__ = ["main"]
 

@@ -34,7 +34,7 @@ from benchmarks.reporting import Row, finish
 from benchmarks.training import Objects
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.stacking import StackedField
+from hyperplanes.adaptation.correction.stacking import StackedField
 from hyperplanes.configuration.presets import preset
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import Shown
@@ -44,7 +44,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering import renderer
 from hyperplanes.rendering.renderer import FieldFunction, Hierarchical
 from hyperplanes.training import Trainer
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task, Tasks
 
 __all__ = ["main"]

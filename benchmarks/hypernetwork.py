@@ -27,7 +27,7 @@ from hyperplanes.data.dataset import open_datasets
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer
 from hyperplanes.training.episodes import prepare_episode
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Tasks
 
 __all__ = ["VARIANTS", "main", "measure", "variant"]

@@ -33,7 +33,7 @@ from hyperplanes.fields import TARGETS, ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.fields.image_based import ImageBasedField
 from hyperplanes.geometry.chosen_views import Visibility
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.training import Trainer
 from hyperplanes.views import Views
 

@@ -27,7 +27,7 @@ from benchmarks.lookup_plot import plot
 from benchmarks.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
 from benchmarks.options import positive
 from benchmarks.reporting import Row, write_rows
-from hyperplanes.utilities.environment import environment
+from hyperplanes.utilities.machine.environment import environment
 
 __all__ = ["main"]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks.lookup_ways import STANDARD
 from benchmarks.reporting import Row
-from hyperplanes.utilities.plots import new_figure, save_figure
+from hyperplanes.utilities.images.plots import new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -33,9 +33,9 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
 from hyperplanes.rendering.compositing import composite_packed, packed_weights
 from hyperplanes.rendering.footprint import footprint
-from hyperplanes.rendering.marching import march
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching, render
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.rendering.sampling.marching import march
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task, Views
 
 __all__ = ["main"]

@@ -15,7 +15,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.renderer import RayMarching
-from hyperplanes.utilities.plots import new_figure, save_figure
+from hyperplanes.utilities.images.plots import new_figure, save_figure
 
 __all__ = ["growth", "plot_growth"]
 

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 from benchmarks.load import load_at_start
-from hyperplanes.utilities.environment import environment
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.writing import write_whole
+from hyperplanes.utilities.machine.environment import environment
 
 __all__ = ["Row", "finish", "write_rows"]
 

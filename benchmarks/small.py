@@ -31,11 +31,11 @@ from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.data import read_task
 from hyperplanes.fields.layers import PackedLayers
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.geometry.visibility import VisibilityPlanes
-from hyperplanes.rendering.marching import RayMarching
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.rendering.refinement import refine as refine_voxels
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.rendering.sampling.marching import RayMarching
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task
 
 __all__ = ["main"]

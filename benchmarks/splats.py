@@ -24,7 +24,7 @@ from hyperplanes.data import read_task
 from hyperplanes.export.baking import BakedScene, bake, default_side
 from hyperplanes.export.splats import fit_splats, splats_of
 from hyperplanes.export.voxel_fitting import STEPS, fit_voxels
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task
 
 __all__ = ["main"]

@@ -29,7 +29,7 @@ from benchmarks.training import Objects, step_parts
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.presets import preset
 from hyperplanes.data import open_dataset
-from hyperplanes.hypernetwork import volume_network
+from hyperplanes.hypernetwork.volume import volume_network
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.training import Trainer
 from hyperplanes.views import Tasks

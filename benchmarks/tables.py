@@ -15,9 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.view_tables import NAMES, Result, views, views_over, views_residuals, views_summary, views_tuned
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.tables import markdown_table
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.files.tables import markdown_table
+from hyperplanes.utilities.files.writing import write_whole
 
 __all__ = ["TABLES", "fill", "main"]
 

@@ -23,8 +23,8 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.presets import Preset, preset
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
 from hyperplanes.training import Trainer
-from hyperplanes.utilities.metrics import psnr
-from hyperplanes.utilities.plots import new_figure, save_figure
+from hyperplanes.utilities.images.metrics import psnr
+from hyperplanes.utilities.images.plots import new_figure, save_figure
 from hyperplanes.views import Task
 
 __all__ = ["main"]

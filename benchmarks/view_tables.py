@@ -6,7 +6,7 @@ from typing import Any
 
 from benchmarks.reporting import Row
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
-from hyperplanes.utilities.tables import markdown_table
+from hyperplanes.utilities.files.tables import markdown_table
 
 __all__ = ["NAMES", "Result", "views", "views_over", "views_residuals", "views_summary", "views_tuned"]
 

@@ -36,15 +36,15 @@ from torch.nn.functional import pad
 from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
+from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
+from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Pictures, Renderable
-from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.checkpoints import find_checkpoint
+from hyperplanes.adaptation.correction.residuals import corrected_field
+from hyperplanes.adaptation.correction.stacking import StackedField
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
-from hyperplanes.adaptation.residuals import corrected_field
-from hyperplanes.adaptation.rotation import RotatedField, Rotation
-from hyperplanes.adaptation.stacking import StackedField
 from hyperplanes.adaptation.swapped import Swapped
-from hyperplanes.adaptation.symmetry import ReflectedHullBlend
+from hyperplanes.adaptation.symmetry.detection import ReflectedHullBlend
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import FewerQueries, Inputs, Shown
@@ -52,10 +52,10 @@ from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.evaluation.comparison import compare
 from hyperplanes.export.images import to_pixels
-from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.metrics import psnr
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.encoding import encode_png
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.files.writing import write_whole
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task, Tasks, Views
 
 __all__ = ["METHODS", "adapters", "add_data_options", "main", "suite_folders"]

@@ -20,7 +20,7 @@ from benchmarks.options import positive
 from benchmarks.reporting import Row, finish
 from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry.chosen_views import Visibility
-from hyperplanes.geometry.visibility import VisibilityPlanes, choose_torch
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes, choose_torch
 from hyperplanes.geometry.volume import volume_of
 from hyperplanes.views import join_views
 

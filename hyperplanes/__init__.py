@@ -16,22 +16,22 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from hyperplanes.utilities.threads import wait_passively
+from hyperplanes.utilities.machine.threads import wait_passively
 
 if TYPE_CHECKING:
+    from hyperplanes.adaptation.baselines.nearest_view import NearestView
     from hyperplanes.adaptation.fine_tuned import FineTuned
     from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
-    from hyperplanes.adaptation.nearest_view import NearestView
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import preset
     from hyperplanes.data import DataError, Dataset, open_dataset, read_task, read_views
     from hyperplanes.evaluation import evaluate
     from hyperplanes.export.images import save_images, save_turntable
-    from hyperplanes.export.mesh import extract_mesh, save_mesh
+    from hyperplanes.export.surfaces.mesh import extract_mesh, save_mesh
     from hyperplanes.geometry import ImagePlanes, Lookup
     from hyperplanes.rendering.renderer import render
     from hyperplanes.training import Trainer
-    from hyperplanes.utilities.metrics import psnr, ssim
+    from hyperplanes.utilities.images.metrics import psnr, ssim
     from hyperplanes.views import Task, Views
 
 wait_passively()  # must run before PyTorch is loaded
@@ -45,22 +45,22 @@ _HOMES = {
     "ImagePlanes": "geometry",
     "Lookup": "geometry",
     "ModelConfig": "adaptation.hyperplanes",
-    "NearestView": "adaptation.nearest_view",
+    "NearestView": "adaptation.baselines.nearest_view",
     "Task": "views",
     "Trainer": "training",
     "Views": "views",
     "evaluate": "evaluation",
-    "extract_mesh": "export.mesh",
+    "extract_mesh": "export.surfaces.mesh",
     "open_dataset": "data",
     "preset": "configuration.presets",
-    "psnr": "utilities.metrics",
+    "psnr": "utilities.images.metrics",
     "read_task": "data",
     "read_views": "data",
     "render": "rendering.renderer",
     "save_images": "export.images",
-    "save_mesh": "export.mesh",
+    "save_mesh": "export.surfaces.mesh",
     "save_turntable": "export.images",
-    "ssim": "utilities.metrics",
+    "ssim": "utilities.images.metrics",
 }
 
 __all__ = [

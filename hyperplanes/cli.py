@@ -17,8 +17,14 @@ from typing import Any, get_type_hints
 
 from hyperplanes.commands import EXAMPLES, find_verb, find_verbs, split_settings
 from hyperplanes.utilities.entry_points import find_entries
-from hyperplanes.utilities.errors import TRACEBACK_VARIABLE, MissingPackageError, is_memory, one_line, wants_traceback
-from hyperplanes.utilities.interrupts import Terminated, interruptible
+from hyperplanes.utilities.machine.interrupts import Terminated, interruptible
+from hyperplanes.utilities.messages.errors import (
+    TRACEBACK_VARIABLE,
+    MissingPackageError,
+    is_memory,
+    one_line,
+    wants_traceback,
+)
 
 __all__ = ["main"]
 

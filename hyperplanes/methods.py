@@ -17,21 +17,21 @@ from typing import Literal
 import torch
 
 from hyperplanes.adaptation.base import AdaptedField, Adapter, Renderable
+from hyperplanes.adaptation.baselines.hull_blend import HullBlend
+from hyperplanes.adaptation.baselines.nearest_view import NearestView
 from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromScratch, random_model, shuffled
 from hyperplanes.adaptation.fine_tuning import made_anyway
-from hyperplanes.adaptation.hull_blend import HullBlend
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.swapped import Swapped
-from hyperplanes.adaptation.symmetry import ReflectedHullBlend
+from hyperplanes.adaptation.symmetry.detection import ReflectedHullBlend
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.presets import Preset, preset
 from hyperplanes.fields import find_targets
-from hyperplanes.rendering.samplers import Sampler
+from hyperplanes.rendering.sampling.samplers import Sampler
 from hyperplanes.utilities.entry_points import load_entries
-from hyperplanes.utilities.errors import did_you_mean
+from hyperplanes.utilities.messages.errors import did_you_mean
 from hyperplanes.views import Views
 
 __all__ = [

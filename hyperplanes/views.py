@@ -17,8 +17,8 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.inputs import Selection, as_selection, check_channels_first, check_indices
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
-from hyperplanes.utilities.arguments import checked, kind_of
-from hyperplanes.utilities.image_range import check_image_range
+from hyperplanes.utilities.images.image_range import check_image_range
+from hyperplanes.utilities.messages.arguments import checked, kind_of
 
 __all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views", "moved"]
 

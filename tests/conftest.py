@@ -53,7 +53,7 @@ if not STARTS_WORKERS:  # the process that starts the workers of `make test` run
     torch.set_num_threads(1)  # tensors are small; tests of threads set their own number
     typechecker.install("hyperplanes")
 
-    from hyperplanes.adaptation import learned_steps
+    from hyperplanes.adaptation.optimisation import learned_steps
 
     ALL_RAYS, learned_steps.RAYS = learned_steps.RAYS, 128  # a learned step then takes a tenth of the time
 
@@ -61,7 +61,7 @@ if not STARTS_WORKERS:  # the process that starts the workers of `make test` run
 @pytest.fixture(scope="module")
 def all_rays():
     """Learned steps compute gradients from as many rays as outside of the tests."""
-    from hyperplanes.adaptation import learned_steps
+    from hyperplanes.adaptation.optimisation import learned_steps
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learned_steps, "RAYS", ALL_RAYS)

@@ -23,12 +23,13 @@ from benchmarks import all as all_benchmarks
 from benchmarks import load as machine_load
 from benchmarks.load import OF_SPEED
 from benchmarks.training import step_parts
-from hyperplanes.adaptation import HyperPlanes, stacking
+from hyperplanes.adaptation import HyperPlanes
+from hyperplanes.adaptation.correction import stacking
 from hyperplanes.fields import TARGETS, ImageBasedNeRF
 from hyperplanes.rendering import RayMarching, renderer
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.utilities.environment import usable_cores
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.machine.environment import usable_cores
 from tests.reference_rendering import Balls
 from tests.training.test_volume_loss import MODEL
 

@@ -33,8 +33,8 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView, Residual
 from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
 from hyperplanes.cli import main
 from hyperplanes.commands import adapt, find_verbs, render
-from hyperplanes.commands.console import Console
-from hyperplanes.commands.scene import read_scene
+from hyperplanes.commands.inputs.scene import read_scene
+from hyperplanes.commands.output.console import Console
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.data import DataError, open_dataset, read_task
@@ -46,8 +46,8 @@ from hyperplanes.export.images import to_pixels
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.rendering.renderer import Hierarchical
 from hyperplanes.training import Trainer
-from hyperplanes.utilities.metrics import psnr
-from hyperplanes.utilities.writing import one_writer
+from hyperplanes.utilities.files.writing import one_writer
+from hyperplanes.utilities.images.metrics import psnr
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
@@ -601,7 +601,7 @@ def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
 
 def test_the_number_of_steps_that_held_out_views_choose_is_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("hyperplanes.configuration.fine_tuning.FineTuning", partial(FineTuning, max_steps=2))
-    monkeypatch.setattr("hyperplanes.export.mesh_level.SILHOUETTE", 16)
+    monkeypatch.setattr("hyperplanes.export.surfaces.mesh_level.SILHOUETTE", 16)
     demo, scene = demo_folder(), str(first_object(demo_folder()))
     command = ["adapt", "--checkpoint", str(demo), "--views", scene, "--out", str(tmp_path / "weights")]
     assert main([*command, "--steps", "auto"]) == 0
@@ -814,7 +814,9 @@ def test_a_cloud_of_points_is_exported(tmp_path, capsys):
 
 def test_errors_of_the_field_name_the_option_as_it_was_typed(tmp_path, monkeypatch, capsys):
     """A level above all densities, and a point cloud of which no point is on the surface."""
-    monkeypatch.setattr("hyperplanes.export.points._is_confirmed", lambda points, *_: torch.zeros(len(points)) > 0)
+    monkeypatch.setattr(
+        "hyperplanes.export.surfaces.points._is_confirmed", lambda points, *_: torch.zeros(len(points)) > 0
+    )
     demo = demo_folder()
     line = ["export", "--checkpoint", str(demo), "--views", str(first_object(demo)), "--out", str(tmp_path)]
     for option, *more in (["--level", "1e9", "--what", "mesh", "--voxels", "8"], ["--points", "1", "--what", "points"]):
@@ -860,7 +862,7 @@ def test_a_camera_path_of_nerfstudio_is_rendered_with_all_requested_outputs(tmp_
 
 
 def test_baking_writes_one_file_that_can_be_rendered_without_the_model(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("hyperplanes.export.mesh_level.SILHOUETTE", 16)
+    monkeypatch.setattr("hyperplanes.export.surfaces.mesh_level.SILHOUETTE", 16)
     out = tmp_path / "voxels.safetensors"
     views = ["--views", str(first_object(demo_folder())), "--out", str(out)]
     command = ["bake", "--checkpoint", str(demo_folder()), *views, "--voxels", "32", "--fit", "2"]
@@ -888,7 +890,7 @@ def test_baking_writes_one_file_that_can_be_rendered_without_the_model(tmp_path,
     assert main(["inspect", str(out)]) == 0
     assert "of 32^3 voxels" in capsys.readouterr().out
     capsys.readouterr()
-    monkeypatch.setattr("hyperplanes.commands.scene.read_scene", None)  # refused before images are read
+    monkeypatch.setattr("hyperplanes.commands.inputs.scene.read_scene", None)  # refused before images are read
     adapting = (["--steps", "3"], ["--refine-poses"], ["--learn-background"])
     for verb, *option in (
         *([verb, *option] for verb in ("render", "export") for option in adapting),
@@ -968,7 +970,7 @@ def test_the_scene_that_comes_with_the_package_has_a_name(tmp_path, monkeypatch,
     task, up = read_scene(Path("example-car"), Console(silent=True))
     assert (len(task.support), len(task.query), task.name, up) == (25, 25, "example-car", "y")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("hyperplanes.adaptation.canonical_frame.find_symmetry", lambda *_: None)
+    monkeypatch.setattr("hyperplanes.adaptation.alignment.canonical_frame.find_symmetry", lambda *_: None)
     assert main(["evaluate", "--data", "example-car", "--method", "nearest_view"]) == 0
     assert "1 object of example-car" in capsys.readouterr().out
     assert main(["inspect", "example-car"]) == 0

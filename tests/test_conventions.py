@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.conversions import normalize_pixel_coordinates
 from scipy.ndimage import map_coordinates
 
-from hyperplanes.data.formats.transforms_document import calibration, transforms_document
+from hyperplanes.data.formats.scenes.transforms_document import calibration, transforms_document
 from hyperplanes.geometry import ImagePlanes, Sphere, cameras, cast
 from hyperplanes.geometry.lookup import lookup
 from hyperplanes.geometry.lookup_torch import interpolate, project

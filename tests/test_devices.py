@@ -9,21 +9,25 @@ import pytest
 import torch
 from second_device import AVAILABLE, second_device
 
-from hyperplanes.adaptation import CorrectedField, HyperPlanes, canonical_frame, held_out, reflections, symmetry
-from hyperplanes.adaptation.canonical_frame import Placed
-from hyperplanes.adaptation.hull_blend import HullBlend
-from hyperplanes.adaptation.judging_symmetry import SymmetryJudge, carved
-from hyperplanes.adaptation.reflections import with_reflections
-from hyperplanes.adaptation.rotation import Rotation
-from hyperplanes.adaptation.stacking import StackedField
-from hyperplanes.adaptation.symmetry import Fold
+from hyperplanes.adaptation import CorrectedField, HyperPlanes
+from hyperplanes.adaptation.alignment import canonical_frame
+from hyperplanes.adaptation.alignment.canonical_frame import Placed
+from hyperplanes.adaptation.alignment.rotation import Rotation
+from hyperplanes.adaptation.baselines.hull_blend import HullBlend
+from hyperplanes.adaptation.correction import held_out
+from hyperplanes.adaptation.correction.stacking import StackedField
+from hyperplanes.adaptation.symmetry import detection as symmetry
+from hyperplanes.adaptation.symmetry import reflections
+from hyperplanes.adaptation.symmetry.detection import Fold
+from hyperplanes.adaptation.symmetry.judging import SymmetryJudge, carved
+from hyperplanes.adaptation.symmetry.reflections import with_reflections
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.presets import preset
 from hyperplanes.data import read_task
 from hyperplanes.export.baking import bake
 from hyperplanes.geometry import ImagePlanes, carve
-from hyperplanes.geometry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
-from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.symmetry.mirror_symmetry import more_symmetric_plane, most_symmetric_plane
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.rendering import RayMarching
 from hyperplanes.training import Trainer
 from hyperplanes.views import Task

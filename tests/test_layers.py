@@ -34,11 +34,18 @@ LAYERS = {
     "hyperplanes.views": 2,
     "hyperplanes.geometry": 1,
     "hyperplanes.hypernetwork": 1,
-    "hyperplanes.adaptation.optimisers": 1,
+    "hyperplanes.adaptation.optimisation.optimisers": 1,
     "hyperplanes.parameters": 1,
     "hyperplanes.utilities": 0.5,
 }
-INSIDE = {"hyperplanes.data": ("pictures", "formats", "dataset", "inspection")}  # from the lowest to the highest
+INSIDE = {  # from the lowest to the highest; modules that are not listed are below all of these
+    "hyperplanes.data": ("pictures", "formats", "dataset", "inspection"),
+    "hyperplanes.adaptation": (
+        *("baselines", "symmetry", "network", "optimisation", "alignment", "correction", "fine_tuning", "hyperplanes"),
+        *("diagnostics", "fine_tuned", "swapped"),
+    ),
+    "hyperplanes.geometry": ("kernels", "lookup", "image_planes", "symmetry", "visibility"),
+}
 OURS = ("hyperplanes", "data_gen", "benchmarks")
 NAMED = re.compile(r"(hyperplanes|data_gen|benchmarks)(\.[a-z]\w*)+(:\w+|\.)?")
 """A string that names a module or one of its objects, or begins such a name in an f-string."""

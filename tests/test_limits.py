@@ -13,17 +13,17 @@ import torch
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.fine_tuned import FineTuned
 from hyperplanes.adaptation.fine_tuning import NoProgressError
-from hyperplanes.adaptation.kept import kept_folder
 from hyperplanes.cli import main
-from hyperplanes.commands import fields
-from hyperplanes.commands.console import Console
+from hyperplanes.commands.inputs import fields
+from hyperplanes.commands.inputs.disk_cache import kept_folder
+from hyperplanes.commands.output.console import Console
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data import read_views
 from hyperplanes.geometry.kernels import compiling
 from hyperplanes.methods import Unchecked
 from hyperplanes.rendering.renderer import render
-from hyperplanes.utilities import memory
-from hyperplanes.utilities.environment import cache_folder
+from hyperplanes.utilities.machine import memory
+from hyperplanes.utilities.machine.environment import cache_folder
 from tests.fuzz.corpus import data_set, posed_scene, small_model
 from tests.reference_rendering import ring
 
@@ -128,7 +128,7 @@ def test_kernels_are_compiled_in_another_folder_if_the_disk_is_full(tmp_path, mo
 
 def test_a_field_that_cannot_be_cached_is_returned(scene, monkeypatch, capsys):
     monkeypatch.setattr(fields, "WORTH_KEEPING", -1.0)
-    monkeypatch.setattr("hyperplanes.adaptation.kept.keep_field", no_room)
+    monkeypatch.setattr("hyperplanes.commands.inputs.disk_cache.keep_field", no_room)
     model, views = HyperPlanes.from_pretrained(scene / "model"), read_views(scene / "scene")
     field, _ = fields.adapt_to(model, views, "a", Console())
     folder = kept_folder(model, views, 0, FineTuning())

@@ -11,8 +11,8 @@ import pytest
 from small_demo import demo_folder, first_object
 
 from hyperplanes.cli import main
-from hyperplanes.commands.console import Console
-from hyperplanes.utilities.writing import one_writer
+from hyperplanes.commands.output.console import Console
+from hyperplanes.utilities.files.writing import one_writer
 from tests.fuzz.corpus import llff
 
 
@@ -68,7 +68,7 @@ def test_the_table_is_shown_before_it_is_written(demo, tmp_path, capsys, monkeyp
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         path.write_text(json.dumps(value))
 
-    monkeypatch.setattr("hyperplanes.utilities.writing.write_json", full)
+    monkeypatch.setattr("hyperplanes.utilities.files.writing.write_json", full)
     command = ["evaluate", "--data", str(demo / "data"), "--method", "nearest_view"]
     assert main([*command, "--json", str(tmp_path / "table.json")]) == 2
     told = capsys.readouterr()

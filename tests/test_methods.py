@@ -17,9 +17,9 @@ from hyperplanes.adaptation import (
     InitialisationConfig,
     NearestView,
     Swapped,
-    judging_symmetry,
 )
 from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
+from hyperplanes.adaptation.symmetry import judging as judging_symmetry
 from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.evaluation import evaluate

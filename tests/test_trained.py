@@ -13,28 +13,22 @@ import pytest
 import torch
 
 from benchmarks.objects import held_out
-from hyperplanes.adaptation import (
-    HullBlend,
-    HyperPlanes,
-    ResidualField,
-    diagnose,
-    learned_steps,
-    reflections,
-    swap_gap,
-    symmetry,
-)
-from hyperplanes.adaptation.descent import LEAST, contrast, draw_pixels
+from hyperplanes.adaptation import HullBlend, HyperPlanes, ResidualField, diagnose, swap_gap
+from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
+from hyperplanes.adaptation.correction.stacking import StackedField
 from hyperplanes.adaptation.fine_tuning import make_descent
-from hyperplanes.adaptation.learned_steps import grid_gradient
-from hyperplanes.adaptation.rotation import RotatedField, Rotation
-from hyperplanes.adaptation.stacking import StackedField
+from hyperplanes.adaptation.optimisation import learned_steps
+from hyperplanes.adaptation.optimisation.descent import LEAST, contrast, draw_pixels
+from hyperplanes.adaptation.optimisation.learned_steps import grid_gradient
+from hyperplanes.adaptation.symmetry import detection as symmetry
+from hyperplanes.adaptation.symmetry import reflections
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import TargetConfig
 from hyperplanes.fields.layers import has_mixed_precision
-from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task
 from tests.reference_rendering import Balls, small_model
 

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from data_gen import SUPERSAMPLE
-from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, optional
-from hyperplanes.utilities.formatting import format_duration
+from hyperplanes.commands.output.console import Console
+from hyperplanes.utilities.messages.formatting import format_duration
 
 if TYPE_CHECKING:
     from data_gen.datasets.generate import GenerationReport, MeshFolder, Procedural

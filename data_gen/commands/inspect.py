@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalFolder
+from hyperplanes.commands.output.console import Console
 
 if TYPE_CHECKING:
     from hyperplanes.adaptation.diagnostics import Diagnostics
@@ -52,8 +52,8 @@ def checkpoint_lines(folder: Path) -> list[str]:
     from hyperplanes.adaptation.checkpoints import checkpoint_folder
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.hypernetwork import ImageHyperNetworkConfig
-    from hyperplanes.utilities.checkpoints import read_json
-    from hyperplanes.utilities.files import malformed
+    from hyperplanes.utilities.files.checkpoints import read_json
+    from hyperplanes.utilities.files.reading import malformed
 
     folder = checkpoint_folder(folder)
     model = HyperPlanes.from_pretrained(folder)
@@ -108,7 +108,7 @@ def baked_lines(path: Path) -> list[str]:
 def recorded_diagnostics(folder: Path) -> Diagnostics | None:
     """The last diagnostics that the training of a checkpoint recorded beside its weights."""
     from hyperplanes.adaptation.diagnostics import Diagnostics
-    from hyperplanes.utilities.checkpoints import read_json
+    from hyperplanes.utilities.files.checkpoints import read_json
 
     if not (folder / "diagnostics.json").exists():
         return None
@@ -118,7 +118,7 @@ def recorded_diagnostics(folder: Path) -> Diagnostics | None:
 def _is_checkpoint(path: Path) -> bool:
     """Whether this is a checkpoint, or the name of a packaged one."""
     from hyperplanes.adaptation.checkpoints import checkpoint_folder
-    from hyperplanes.utilities.checkpoints import CheckpointError
+    from hyperplanes.utilities.files.checkpoints import CheckpointError
 
     try:
         return (checkpoint_folder(path) / "model.json").exists()
@@ -157,9 +157,9 @@ def _inspect(arguments: Arguments, console: Console) -> int:
             console.say(line)
         return 0
     from data_gen.datasets.inspect import inspect
-    from hyperplanes.commands.scene import refuse_sources
+    from hyperplanes.commands.inputs.scene import refuse_sources
     from hyperplanes.data.dataset import locate_scene
-    from hyperplanes.utilities.files import DataError
+    from hyperplanes.utilities.files.reading import DataError
 
     if not locate_scene(arguments.path).exists():
         raise DataError(

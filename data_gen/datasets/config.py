@@ -12,7 +12,7 @@ from data_gen import SUPERSAMPLE
 from data_gen.datasets.layouts import LAYOUTS
 from data_gen.datasets.sources import seed_of
 from data_gen.rigs import DEFAULT_DISTANCE, OBJECT_RADIUS, RIG_PRESETS, RIGS, Rig, make_rig
-from hyperplanes.utilities.errors import did_you_mean
+from hyperplanes.utilities.messages.errors import did_you_mean
 
 __all__ = ["ENGINES", "GenerationConfig"]
 

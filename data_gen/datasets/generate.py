@@ -16,8 +16,8 @@ from data_gen.datasets.manifest import Entry, GenerationState, build_manifest, h
 from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
 from data_gen.rigs import OBJECT_RADIUS
-from hyperplanes.utilities.environment import usable_cores
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.machine.environment import usable_cores
 
 __all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
 

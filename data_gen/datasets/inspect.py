@@ -13,9 +13,9 @@ import numpy as np
 
 from data_gen.datasets.contact_sheet import contact_sheet
 from data_gen.datasets.manifest import Verification, verify
-from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import read_json
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.encoding import encode_png
+from hyperplanes.utilities.files.reading import read_json
+from hyperplanes.utilities.files.writing import write_whole
 
 __all__ = ["Inspection", "inspect"]
 
@@ -107,7 +107,7 @@ def _all_views(data: Any, name: str) -> Any:
 def _sparse(folder: Path, posed: Any) -> Any:
     """The points of a reconstruction beside a scene, in the world with y up; with `capture`'s reprojection errors."""
     from hyperplanes.capture.sparse_model import SparseModel
-    from hyperplanes.data.formats.sparse_points import read_sparse_points
+    from hyperplanes.data.formats.scenes.sparse_points import read_sparse_points
     from hyperplanes.data.upright import guess_up, y_up_from
 
     if not folder.is_dir() and folder.suffix != ".json":
@@ -165,7 +165,7 @@ def _cameras(views: Any, support: int, title: str, sparse: Any) -> bytes:
         title: of the picture.
         sparse: points of a reconstruction, in the same world, or None; those far away are left out.
     """
-    from hyperplanes.utilities.plots import encode_figure, new_figure
+    from hyperplanes.utilities.images.plots import encode_figure, new_figure
 
     figure = new_figure(8, 8)
     axes: Any = figure.add_subplot(projection="3d")

@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from data_gen.datasets.sources import Item
 from data_gen.rigs import DEFAULT_DISTANCE, OBJECT_RADIUS, Rig
-from hyperplanes.data.formats.transforms_document import transforms_document
+from hyperplanes.data.formats.scenes.transforms_document import transforms_document
 from hyperplanes.utilities.axes import flip_camera_axes
-from hyperplanes.utilities.encoding import encode_json, encode_npz, encode_png
+from hyperplanes.utilities.files.encoding import encode_json, encode_npz, encode_png
 
 __all__ = ["LAYOUTS", "Layout", "RenderedObject", "check_names"]
 

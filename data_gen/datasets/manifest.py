@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hyperplanes.utilities.encoding import encode_json, sha256
-from hyperplanes.utilities.files import DataError, inside, malformed, read_bytes, read_json
-from hyperplanes.utilities.settings import flattened
-from hyperplanes.utilities.writing import one_writer, write_whole
+from hyperplanes.utilities.files.encoding import encode_json, sha256
+from hyperplanes.utilities.files.reading import DataError, inside, malformed, read_bytes, read_json
+from hyperplanes.utilities.files.settings import flattened
+from hyperplanes.utilities.files.writing import one_writer, write_whole
 
 if TYPE_CHECKING:
     from data_gen.datasets.sources import Item

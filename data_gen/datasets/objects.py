@@ -10,8 +10,8 @@ from typing import Any
 from data_gen.datasets.config import GenerationConfig
 from data_gen.datasets.layouts import LAYOUTS, RenderedObject
 from data_gen.datasets.sources import Item
-from hyperplanes.utilities.encoding import encode_json, sha256
-from hyperplanes.utilities.writing import write_folder, write_whole
+from hyperplanes.utilities.files.encoding import encode_json, sha256
+from hyperplanes.utilities.files.writing import write_folder, write_whole
 
 __all__ = ["open_renderer"]
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from data_gen.datasets.worker_process import process_item
 from data_gen.datasets.workers import START_SECONDS, Outcome, WorkerLost, WorkerTimeout, run_workers, worker_environment
-from hyperplanes.utilities.environment import usable_cores
+from hyperplanes.utilities.machine.environment import usable_cores
 
 __all__ = ["run_on_ray"]
 

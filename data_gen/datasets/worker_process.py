@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pkgutil import resolve_name
 from typing import Any
 
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 
 __all__ = ["main", "process_item"]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import PIL.Image
 
-from hyperplanes.utilities.errors import one_line
+from hyperplanes.utilities.messages.errors import one_line
 
 __all__ = [
     "IMAGE_FORMATS",

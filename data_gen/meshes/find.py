@@ -12,7 +12,7 @@ from pathlib import Path
 
 from data_gen.meshes.files import MESH_SUFFIXES, OTHER_SUFFIXES, MeshError
 from data_gen.meshes.shapenet import class_of_synset, find_models, is_shapenet, paper_split, read_split_file
-from hyperplanes.utilities.encoding import sha256
+from hyperplanes.utilities.files.encoding import sha256
 
 __all__ = ["FoundMeshes", "MeshFile", "find_meshes", "safe_name"]
 

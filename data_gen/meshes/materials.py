@@ -17,7 +17,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import Material, MultiMaterial, PBRMaterial, SimpleMaterial
 
 from data_gen.meshes.files import IMAGE_FORMATS
-from hyperplanes.utilities.colour import linear_from_srgb, srgb_from_linear
+from hyperplanes.utilities.images.colour import linear_from_srgb, srgb_from_linear
 
 __all__ = [
     "DEFAULT_COLOUR",

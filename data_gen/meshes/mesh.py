@@ -22,7 +22,7 @@ from data_gen.meshes.formats.dae import declared_up
 from data_gen.meshes.formats.read import read_scene
 from data_gen.meshes.materials import ColourSpace, canonical_visual
 from data_gen.meshes.model_folder import ModelFolder
-from hyperplanes.utilities.encoding import sha256
+from hyperplanes.utilities.files.encoding import sha256
 
 __all__ = [
     "MAX_FACES",

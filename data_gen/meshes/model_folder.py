@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from trimesh.resolvers import Resolver
 
 from data_gen.meshes.files import MAX_FILE_BYTES, MAX_PIXELS, MeshError, check_image, read_bytes
-from hyperplanes.utilities.encoding import sha256
+from hyperplanes.utilities.files.encoding import sha256
 
 __all__ = ["MAX_REFERENCES", "ModelFolder", "model_checksums", "model_root", "without_comment"]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from data_gen.meshes.files import MeshError
-from hyperplanes.utilities.files import DataError, read_bytes
+from hyperplanes.utilities.files.reading import DataError, read_bytes
 
 __all__ = [
     "SYNSETS",

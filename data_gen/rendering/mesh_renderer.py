@@ -133,7 +133,7 @@ class MeshRenderer:
             pictures["rgba"] = np.stack(list(self._renderer.draw(surfaces, rig, lights, self.supersample)))
             visible = pictures["rgba"][..., 3].any()
         if set(channels) - {"rgba"}:
-            from data_gen.rendering.embree import cast_geometry
+            from data_gen.rendering.ray_tracing.embree import cast_geometry
 
             views = list(cast_geometry(surfaces, rig))
             for channel in CHANNELS[1:]:
@@ -151,10 +151,10 @@ def _make_renderer(name: str) -> ViewRenderer:
         raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}")
     try:
         if name == "embree":
-            from data_gen.rendering.embree import EmbreeRenderer
+            from data_gen.rendering.ray_tracing.embree import EmbreeRenderer
 
             return EmbreeRenderer()
-        from data_gen.rendering.pyrender_renderer import PyrenderRenderer
+        from data_gen.rendering.opengl.pyrender_renderer import PyrenderRenderer
 
         return PyrenderRenderer(name.removeprefix("pyrender-"))
     except RendererError:

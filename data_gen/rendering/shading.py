@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from data_gen.rendering.lighting import Lighting
-from hyperplanes.utilities.colour import srgb_from_linear
+from hyperplanes.utilities.images.colour import srgb_from_linear
 
 __all__ = ["SHOULDER", "facing", "shade"]
 

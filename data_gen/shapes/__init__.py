@@ -12,14 +12,14 @@ from collections.abc import Callable
 import numpy as np
 import trimesh
 
-from data_gen.shapes.car import car
-from data_gen.shapes.chair import chair
-from data_gen.shapes.lamp import lamp
+from data_gen.shapes.cars.car import car
+from data_gen.shapes.chairs.chair import chair
+from data_gen.shapes.lamps.lamp import lamp
 from data_gen.shapes.parts import Part, build_scene
-from data_gen.shapes.plane import plane
+from data_gen.shapes.planes.plane import plane
 from data_gen.shapes.random import composition
 from hyperplanes.utilities.entry_points import load_entries
-from hyperplanes.utilities.errors import did_you_mean
+from hyperplanes.utilities.messages.errors import did_you_mean
 
 __all__ = ["CLASSES", "ONE_SIDED", "assemble", "check_class", "find_classes", "make"]
 

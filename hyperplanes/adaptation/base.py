@@ -19,16 +19,16 @@ from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.occupancy import Occupancy, carve, full
 from hyperplanes.geometry.rays import Rays
-from hyperplanes.geometry.reflections import Symmetry
+from hyperplanes.geometry.symmetry.reflections import Symmetry
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.rendering.images import Pictures
 from hyperplanes.rendering.refinement import RefinedOccupancy, refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
 from hyperplanes.rendering.scene import dtype_of, is_thread_safe, mapped
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.kept import kept
-from hyperplanes.utilities.precision import without_autocast
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.views import Views
 
 __all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "attributes_of", "hull"]
@@ -100,7 +100,7 @@ class AdaptedField:
         return replace(self, sampling=sampling)
 
     def without_residuals(self) -> AdaptedField:
-        """The same field without residual correction of its pictures (`adaptation.residuals`)."""
+        """The same field without residual correction of its pictures (`adaptation.correction.residuals`)."""
         return self
 
     @property

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from hyperplanes.adaptation.hub import download_checkpoint, is_repository
 from hyperplanes.configuration.model import ModelConfig
-from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
-from hyperplanes.utilities.errors import did_you_mean
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.checkpoints import CheckpointError, load_tensors, save_tensors
+from hyperplanes.utilities.files.writing import write_json
+from hyperplanes.utilities.messages.errors import did_you_mean
 
 __all__ = [
     "checkpoint_folder",

@@ -14,8 +14,8 @@ from torch.nn.utils.rnn import pad_sequence
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.reflections import Symmetry
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.symmetry.reflections import Symmetry
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.hypernetwork import Observed
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views

@@ -14,8 +14,8 @@ from torch import Tensor
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.network import in_use
-from hyperplanes.utilities.checkpoints import CheckpointError
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.files.checkpoints import CheckpointError
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
 
 __all__ = ["SMALLEST_SPREAD", "Diagnostics", "diagnose", "swap_gap"]

@@ -11,7 +11,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.fields import find_targets
-from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.messages.arguments import checked
 from hyperplanes.views import Views
 
 __all__ = ["SCRATCH_RATES", "FieldFromScratch", "FineTuned", "FromScratch", "random_model", "shuffled"]

@@ -11,13 +11,13 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.context import SupportContext, observe, trained_on
-from hyperplanes.adaptation.descent import Descent, split_holdout
-from hyperplanes.adaptation.learned_steps import updated_weights
+from hyperplanes.adaptation.correction.stacking import stacked_field, tuned_field
 from hyperplanes.adaptation.network import HyperPlanesNetwork
-from hyperplanes.adaptation.stacking import stacked_field, tuned_field
+from hyperplanes.adaptation.optimisation.descent import Descent, split_holdout
+from hyperplanes.adaptation.optimisation.learned_steps import updated_weights
 from hyperplanes.configuration.compatibility import check_fine_tuning
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.parameters import Parameters

@@ -8,8 +8,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from hyperplanes.utilities.checkpoints import CheckpointError
-from hyperplanes.utilities.errors import MissingPackageError
+from hyperplanes.utilities.files.checkpoints import CheckpointError
+from hyperplanes.utilities.messages.errors import MissingPackageError
 
 __all__ = ["download_checkpoint", "is_repository", "upload_checkpoint"]
 

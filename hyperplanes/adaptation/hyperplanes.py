@@ -9,24 +9,24 @@ from typing import Self
 
 import torch
 
+from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
+from hyperplanes.adaptation.alignment.finding_symmetry import find_symmetry
+from hyperplanes.adaptation.alignment.rotation import RotatedField
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.checkpoints import read_checkpoint, write_checkpoint
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.adaptation.finding_symmetry import find_symmetry
+from hyperplanes.adaptation.correction.residuals import corrected_field
+from hyperplanes.adaptation.correction.stacking import learned_part, stacked_field
 from hyperplanes.adaptation.fine_tuning import fine_tune
 from hyperplanes.adaptation.hub import upload_checkpoint
-from hyperplanes.adaptation.learned_steps import updated_weights
 from hyperplanes.adaptation.network import HyperPlanesNetwork
-from hyperplanes.adaptation.residuals import corrected_field
-from hyperplanes.adaptation.rotation import RotatedField
-from hyperplanes.adaptation.stacking import learned_part, stacked_field
+from hyperplanes.adaptation.optimisation.learned_steps import updated_weights
 from hyperplanes.configuration.fine_tuning import FineTuning, Steps
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.geometry.inputs import check_precision
-from hyperplanes.geometry.reflections import Symmetry
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.precision import without_autocast
+from hyperplanes.geometry.symmetry.reflections import Symmetry
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.views import Views
 
 __all__ = ["HyperPlanes", "ModelConfig"]
@@ -52,7 +52,7 @@ class HyperPlanes(HyperPlanesNetwork):
         return self
 
     def without_residuals(self) -> Self:
-        """This model, from now on without residual correction of its pictures (`adaptation.residuals`)."""
+        """This model, from now on without residual correction of its pictures (`adaptation.correction.residuals`)."""
         self.config = replace(self.config, residuals=False)
         return self
 
@@ -63,11 +63,11 @@ class HyperPlanes(HyperPlanesNetwork):
     def adapt(self, support: Views) -> AdaptedField:
         """The field of one object in one forward pass: theta + delta (HyperPlanes, Eq. 6).
 
-        Then come `config.learned_steps` steps of gradient descent by a network (`adaptation.learned_steps`). With
+        Then come `config.learned_steps` steps of gradient descent by a network (`optimisation.learned_steps`). With
         `config.symmetric`, reflections of the views of an object that looks symmetric are added to its views
-        (`adaptation.symmetry`), and it is adapted to in its canonical frame (`adaptation.canonical_frame`). With
-        `config.stacked`, pictures are averaged with those of the visual hull (`adaptation.stacking`). With
-        `config.residuals`, pictures are corrected by the residuals of the support views (`adaptation.residuals`).
+        (`symmetry.detection`), and it is adapted to in its canonical frame (`alignment.canonical_frame`). With
+        `config.stacked`, pictures are averaged with those of the visual hull (`correction.stacking`). With
+        `config.residuals`, pictures are corrected by the residuals of the support views (`correction.residuals`).
         """
         placed = to_canonical_frame(self, support)
         context = placed.context(self)

@@ -13,19 +13,19 @@ from torch import Tensor, nn
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.context import SupportContext, live_pixels, observe
 from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.reflections import UNKNOWN, handicaps, with_reflections
+from hyperplanes.adaptation.symmetry.reflections import UNKNOWN, handicaps, with_reflections
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
 from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.occupancy import full
-from hyperplanes.geometry.reflections import Symmetry
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.symmetry.reflections import Symmetry
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.hypernetwork import HyperNetwork, LearnedStep
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.seeding import seeded
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.seeding import seeded
 from hyperplanes.views import Views
 
 __all__ = ["GRID", "HyperPlanesNetwork", "in_use"]

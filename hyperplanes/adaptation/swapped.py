@@ -7,13 +7,13 @@ from collections.abc import Iterable
 
 import torch
 
+from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.canonical_frame import to_canonical_frame
+from hyperplanes.adaptation.correction.residuals import corrected_field
+from hyperplanes.adaptation.correction.stacking import stacked_field
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.learned_steps import take_learned_steps
 from hyperplanes.adaptation.network import in_use
-from hyperplanes.adaptation.residuals import corrected_field
-from hyperplanes.adaptation.stacking import stacked_field
+from hyperplanes.adaptation.optimisation.learned_steps import take_learned_steps
 from hyperplanes.parameters import Parameters
 from hyperplanes.views import Views
 

@@ -7,7 +7,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from hyperplanes.utilities.interrupts import interrupt_behind, keep_handlers
+from hyperplanes.utilities.machine.interrupts import interrupt_behind, keep_handlers
 
 __all__ = ["is_installed", "require", "stated_threads"]
 

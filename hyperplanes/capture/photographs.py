@@ -27,9 +27,9 @@ from hyperplanes.data.pictures.images import (
     turned,
 )
 from hyperplanes.data.pictures.masks import match_masks
-from hyperplanes.utilities.errors import listed
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.formatting import counted
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.messages.errors import listed
+from hyperplanes.utilities.messages.formatting import counted
 
 __all__ = ["FEWEST", "Photograph", "find_photographs", "list_photographs", "read_upright", "without_copies"]
 

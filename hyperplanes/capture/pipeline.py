@@ -29,12 +29,12 @@ from hyperplanes.capture.structure_from_motion import ATTEMPTS, EXHAUSTIVE, Pict
 from hyperplanes.capture.video import take_frames
 from hyperplanes.data.pictures.images import VIDEO_SUFFIXES, Pixels, read_image
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.arguments import checked_fields
-from hyperplanes.utilities.encoding import encode_jpeg, encode_png, sha256
-from hyperplanes.utilities.errors import listed
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.formatting import counted
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.encoding import encode_jpeg, encode_png, sha256
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.files.writing import write_whole
+from hyperplanes.utilities.messages.arguments import checked_fields
+from hyperplanes.utilities.messages.errors import listed
+from hyperplanes.utilities.messages.formatting import counted
 
 __all__ = ["Captured", "Progress", "Settings", "capture"]
 

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from hyperplanes.capture.sparse_model import SparseModel
-from hyperplanes.data.formats.transforms_document import transforms_document
+from hyperplanes.data.formats.scenes.transforms_document import transforms_document
 from hyperplanes.data.pictures.undistort import undistort
-from hyperplanes.utilities.encoding import encode_ply
-from hyperplanes.utilities.files import DataError, read_json
-from hyperplanes.utilities.writing import write_json, write_whole
+from hyperplanes.utilities.files.encoding import encode_ply
+from hyperplanes.utilities.files.reading import DataError, read_json
+from hyperplanes.utilities.files.writing import write_json, write_whole
 
 __all__ = ["Captured", "straightened", "write_scene"]
 

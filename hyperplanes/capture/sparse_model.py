@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from hyperplanes.utilities.encoding import encode_npz
-from hyperplanes.utilities.files import DataError, malformed
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.encoding import encode_npz
+from hyperplanes.utilities.files.reading import DataError, malformed
+from hyperplanes.utilities.files.writing import write_whole
 
 __all__ = ["SparseModel"]
 

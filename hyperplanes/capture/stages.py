@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hyperplanes.utilities.encoding import sha256
-from hyperplanes.utilities.files import DataError, read_json
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.encoding import sha256
+from hyperplanes.utilities.files.reading import DataError, read_json
+from hyperplanes.utilities.files.writing import write_json
 
 __all__ = ["Stages", "fingerprint"]
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from hyperplanes.capture.packages import require, stated_threads
 from hyperplanes.capture.sparse_model import SparseModel
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.writing import write_whole
 
 __all__ = ["ATTEMPTS", "Features", "Picture", "find_poses", "pairs_to_match"]
 

@@ -10,9 +10,9 @@ from PIL import Image
 from scipy import ndimage
 
 from hyperplanes.capture.packages import require
-from hyperplanes.utilities.encoding import encode_jpeg
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.encoding import encode_jpeg
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.files.writing import write_whole
 
 __all__ = ["sharpness", "take_frames"]
 

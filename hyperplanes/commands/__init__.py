@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Any
 
 from hyperplanes.utilities.entry_points import load_entries
-from hyperplanes.utilities.errors import nearest
+from hyperplanes.utilities.messages.errors import nearest
 
 __all__ = ["EXAMPLES", "VERBS", "Verb", "find_verb", "find_verbs", "split_settings"]
 

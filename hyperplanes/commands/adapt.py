@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, load_adaptable, refuse_baked
+from hyperplanes.commands.inputs.fields import adapt_to, load_adaptable, refuse_baked
+from hyperplanes.commands.inputs.scene import read_object, refuse_sources
 from hyperplanes.commands.options import Free, ObjectArguments, check_fine_tune
-from hyperplanes.commands.scene import read_object, refuse_sources
-from hyperplanes.commands.writing import refuse_checkpoint, writes_to
-from hyperplanes.utilities.shell import command_line
+from hyperplanes.commands.output.console import Console
+from hyperplanes.commands.output.writing import refuse_checkpoint, writes_to
+from hyperplanes.utilities.messages.shell import command_line
 
 __all__ = ["Arguments", "run"]
 

@@ -16,12 +16,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, bake_field, load_adaptable, refuse_baked
+from hyperplanes.commands.inputs.fields import adapt_to, bake_field, load_adaptable, refuse_baked
+from hyperplanes.commands.inputs.scene import read_object, refuse_sources
 from hyperplanes.commands.options import ObjectArguments, OptionalInt, check_orbit, optional
-from hyperplanes.commands.scene import read_object, refuse_sources
-from hyperplanes.commands.writing import check_output, refuse_checkpoint
-from hyperplanes.utilities.formatting import format_duration
+from hyperplanes.commands.output.console import Console
+from hyperplanes.commands.output.writing import check_output, refuse_checkpoint
+from hyperplanes.utilities.messages.formatting import format_duration
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -70,9 +70,9 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.baking import BakedScene, coarsening, default_side
     from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, to_pixels
     from hyperplanes.geometry import cameras as camera
-    from hyperplanes.utilities.errors import rename_errors
-    from hyperplanes.utilities.metrics import psnr
-    from hyperplanes.utilities.writing import write_whole
+    from hyperplanes.utilities.files.writing import write_whole
+    from hyperplanes.utilities.images.metrics import psnr
+    from hyperplanes.utilities.messages.errors import rename_errors
 
     _refuse_sources(arguments)
     check_output("out", arguments.out)

@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from hyperplanes.commands.console import Console
-from hyperplanes.commands.writing import writes_to
-from hyperplanes.utilities.formatting import format_duration
-from hyperplanes.utilities.shell import command_line
+from hyperplanes.commands.output.console import Console
+from hyperplanes.commands.output.writing import writes_to
+from hyperplanes.utilities.messages.formatting import format_duration
+from hyperplanes.utilities.messages.shell import command_line
 
 if TYPE_CHECKING:
-    from hyperplanes.commands.console import Bar
+    from hyperplanes.commands.output.console import Bar
 
 __all__ = ["Arguments", "run"]
 

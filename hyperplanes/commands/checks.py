@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hyperplanes.utilities.entry_points import find_entries, load_entries
-from hyperplanes.utilities.environment import usable_cores
+from hyperplanes.utilities.machine.environment import usable_cores
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement

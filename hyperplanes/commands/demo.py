@@ -21,16 +21,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalFolder, OptionalInt
+from hyperplanes.commands.output.console import Console
+from hyperplanes.commands.output.writing import writes_to
 from hyperplanes.commands.runs import count_workers, make_runner, make_workers
-from hyperplanes.commands.writing import writes_to
-from hyperplanes.utilities.formatting import format_duration
+from hyperplanes.utilities.messages.formatting import format_duration
 
 if TYPE_CHECKING:
     from hyperplanes.experiments.demonstration.settings import DemoSettings
     from hyperplanes.experiments.engine import OnScore, Runner
-    from hyperplanes.experiments.scales import Scale
+    from hyperplanes.experiments.paper.scales import Scale
     from hyperplanes.experiments.workspace import Workspace
 
 __all__ = ["Arguments", "run", "settings_of"]
@@ -148,7 +148,7 @@ def run(arguments: Arguments) -> int:
 
 def _finish(out: Path, console: Console) -> None:
     from hyperplanes.experiments.demonstration.settings import describe_row
-    from hyperplanes.utilities.checkpoints import read_json
+    from hyperplanes.utilities.files.checkpoints import read_json
 
     metrics = read_json(out / "metrics.json")
     rows = [

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hyperplanes.commands.console import Console
+from hyperplanes.commands.output.console import Console
 
 if TYPE_CHECKING:
     from hyperplanes.commands.checks import Check

@@ -33,10 +33,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import Free, OptionalInt, Protocol, ViewsUp, check_fine_tune, optional
-from hyperplanes.commands.writing import check_output
-from hyperplanes.utilities.formatting import counted
+from hyperplanes.commands.output.console import Console
+from hyperplanes.commands.output.writing import check_output
+from hyperplanes.utilities.messages.formatting import counted
 
 if TYPE_CHECKING:
     from hyperplanes.data import Dataset
@@ -162,7 +162,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.evaluation.perceptual import LPIPS
     from hyperplanes.evaluation.tables import PAIR_HEADINGS, compared_rows, headings, rows
     from hyperplanes.methods import Request, WithSampler, make_method
-    from hyperplanes.utilities.errors import listed
+    from hyperplanes.utilities.messages.errors import listed
 
     _check(arguments)
     console, device = Console(), choose_device(arguments.device)
@@ -247,7 +247,7 @@ def run(arguments: Arguments) -> int:
 
 def _check(arguments: Arguments) -> None:
     """Refuse wrong options before anything is read."""
-    from hyperplanes.utilities.plots import figure_kind
+    from hyperplanes.utilities.images.plots import figure_kind
 
     if not arguments.method:
         raise ValueError("--method: expected at least one, got none")
@@ -278,7 +278,7 @@ def _check(arguments: Arguments) -> None:
 def _tasks(arguments: Arguments, opened: Dataset, seed: int) -> Tasks:
     """The objects with the requested support and query views."""
     from hyperplanes.data.support import FewerQueries, Inputs, WithSupport
-    from hyperplanes.utilities.errors import rename_errors
+    from hyperplanes.utilities.messages.errors import rename_errors
 
     tasks: Tasks = opened
     if arguments.inputs:
@@ -298,7 +298,7 @@ def _supports(data: Tasks, names: Sequence[str]) -> Iterator[Views]:
 
 def _up(arguments: Arguments, data: Dataset, console: Console) -> str | None:
     """The direction that is up in the world of the data; None where each object's files say it, or it is y."""
-    from hyperplanes.commands.scene import say_up
+    from hyperplanes.commands.inputs.scene import say_up
     from hyperplanes.data.upright import y_up_from
 
     if arguments.up == "auto":
@@ -335,7 +335,7 @@ def _of_shown(scores: Sequence[Score]) -> str:
 def _write(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Comparison]) -> None:
     """Every file but the grid of pictures."""
     from hyperplanes.evaluation import figures, tables
-    from hyperplanes.utilities.writing import write_json, write_whole
+    from hyperplanes.utilities.files.writing import write_json, write_whole
 
     if arguments.json is not None:
         write_json(arguments.json, tables.as_json(scores, pairs))

@@ -15,11 +15,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, bake_field, load_source, refuse_of_baked, render_views
+from hyperplanes.commands.inputs.fields import adapt_to, bake_field, load_source, refuse_of_baked, render_views
+from hyperplanes.commands.inputs.scene import read_object, refuse_sources
 from hyperplanes.commands.options import ObjectArguments, OptionalInt, check_orbit, optional
-from hyperplanes.commands.scene import read_object, refuse_sources
-from hyperplanes.commands.writing import writes_to
+from hyperplanes.commands.output.console import Console
+from hyperplanes.commands.output.writing import writes_to
 
 if TYPE_CHECKING:
     from hyperplanes.adaptation.base import AdaptedField
@@ -99,11 +99,11 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.animation import choose_representation
     from hyperplanes.export.baking import BakedScene, coarsening, default_side
     from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, save_images, to_pixels
-    from hyperplanes.export.mesh import check_voxels
     from hyperplanes.export.page import page_of, save_page, turning_picture
-    from hyperplanes.utilities.errors import rename_errors
-    from hyperplanes.utilities.formatting import counted
-    from hyperplanes.utilities.writing import write_whole
+    from hyperplanes.export.surfaces.mesh import check_voxels
+    from hyperplanes.utilities.files.writing import write_whole
+    from hyperplanes.utilities.messages.errors import rename_errors
+    from hyperplanes.utilities.messages.formatting import counted
 
     if not arguments.what:
         raise ValueError("--what: expected at least one of images, turntable, mesh, page, splats, points, got none")
@@ -157,7 +157,7 @@ def run(arguments: Arguments) -> int:
         solid = field if isinstance(field, AdaptedField) else field.adapted
         _write_mesh(solid, shown, query, arguments, console, adaptable=not isinstance(source, BakedScene))
     if "points" in arguments.what:
-        from hyperplanes.export.points import point_cloud, save_points
+        from hyperplanes.export.surfaces.points import point_cloud, save_points
 
         bounds = (field if isinstance(field, AdaptedField) else field.adapted).occupancy.bounds
         plain = field.without_residuals() if isinstance(field, AdaptedField) else field
@@ -204,7 +204,7 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
     from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
     from hyperplanes.export.voxel_fitting import render_guide
     from hyperplanes.geometry.distortion import DistortedCamera
-    from hyperplanes.utilities.metrics import psnr
+    from hyperplanes.utilities.images.metrics import psnr
 
     splats, quality = splats_of(baked), ""
     straight = not isinstance(shown.cameras, DistortedCamera)
@@ -231,11 +231,11 @@ def _write_mesh(
 
     `adaptable` is false for a baked file. That refuses `--steps`, so the warning does not advise them.
     """
-    from hyperplanes.export.mesh import density_grid, extract_mesh, save_mesh
-    from hyperplanes.export.mesh_filling import fill_hidden
-    from hyperplanes.export.mesh_level import agreement, choose_level
-    from hyperplanes.export.texture import save_textured, texture_surface
-    from hyperplanes.utilities.errors import rename_errors
+    from hyperplanes.export.surfaces.mesh import density_grid, extract_mesh, save_mesh
+    from hyperplanes.export.surfaces.mesh_filling import fill_hidden
+    from hyperplanes.export.surfaces.mesh_level import agreement, choose_level
+    from hyperplanes.export.surfaces.texture import save_textured, texture_surface
+    from hyperplanes.utilities.messages.errors import rename_errors
 
     density, level = density_grid(solid, arguments.voxels), arguments.level
     if level is None:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import optional
+from hyperplanes.commands.output.console import Console
 
 if TYPE_CHECKING:
     from hyperplanes.configuration.presets import Preset

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to, bake_field, load_source, refuse_of_baked, render_views
+from hyperplanes.commands.inputs.fields import adapt_to, bake_field, load_source, refuse_of_baked, render_views
+from hyperplanes.commands.inputs.scene import read_object, read_path, refuse_sources
 from hyperplanes.commands.options import (
     Free,
     ObjectArguments,
@@ -34,9 +34,9 @@ from hyperplanes.commands.options import (
     check_orbit,
     optional,
 )
-from hyperplanes.commands.scene import read_object, read_path, refuse_sources
-from hyperplanes.commands.writing import writes_to
-from hyperplanes.utilities.formatting import counted, format_duration
+from hyperplanes.commands.output.console import Console
+from hyperplanes.commands.output.writing import writes_to
+from hyperplanes.utilities.messages.formatting import counted, format_duration
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -106,8 +106,8 @@ class Asked:
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt, render, write the pictures, and print their PSNR if the true images are known."""
+    from hyperplanes.adaptation.correction.residuals import CorrectedField, ResidualField
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
-    from hyperplanes.adaptation.residuals import CorrectedField, ResidualField
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
@@ -117,8 +117,8 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.images import encode_animation
     from hyperplanes.export.outputs import output_frames, save_outputs
     from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
-    from hyperplanes.utilities.errors import listed
-    from hyperplanes.utilities.writing import write_whole
+    from hyperplanes.utilities.files.writing import write_whole
+    from hyperplanes.utilities.messages.errors import listed
 
     _check(arguments)
     console, device = Console(), choose_device(arguments.device)
@@ -248,8 +248,8 @@ def _compared(
     The result is None if the model was given the views that are compared. `finished` is true for a baked file and for
     the weights of one object, which do not record the views that they were made from.
     """
-    from hyperplanes.adaptation.nearest_view import NearestView
-    from hyperplanes.utilities.metrics import psnr, ssim
+    from hyperplanes.adaptation.baselines.nearest_view import NearestView
+    from hyperplanes.utilities.images.metrics import psnr, ssim
 
     images = pictures.images.clamp(0, 1).to(known.images.device)
     value = float(psnr(images, known.images).mean())

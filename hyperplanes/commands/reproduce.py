@@ -24,15 +24,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from hyperplanes.commands.console import Console
 from hyperplanes.commands.options import OptionalInt
+from hyperplanes.commands.output.console import Console
+from hyperplanes.commands.output.writing import writes_to
 from hyperplanes.commands.runs import make_runner, make_workers
-from hyperplanes.commands.writing import writes_to
-from hyperplanes.utilities.shell import command_line
+from hyperplanes.utilities.messages.shell import command_line
 
 if TYPE_CHECKING:
     from hyperplanes.evaluation import ObjectScore
-    from hyperplanes.experiments.experiment import Cell
+    from hyperplanes.experiments.paper.experiment import Cell
 
 __all__ = ["Arguments", "data_sets", "run"]
 
@@ -99,11 +99,11 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
     from hyperplanes.experiments.estimate import estimate
     from hyperplanes.experiments.figures import curves_of, figure_of, pictures_of
-    from hyperplanes.experiments.tables import CLASSES
+    from hyperplanes.experiments.paper.tables import CLASSES
     from hyperplanes.experiments.workspace import Workspace
-    from hyperplanes.utilities.formatting import format_duration
-    from hyperplanes.utilities.plots import save_figure
-    from hyperplanes.utilities.writing import write_json, write_whole
+    from hyperplanes.utilities.files.writing import write_json, write_whole
+    from hyperplanes.utilities.images.plots import save_figure
+    from hyperplanes.utilities.messages.formatting import format_duration
 
     console = Console()
     scale = SCALES[arguments.scale]

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hyperplanes.commands.console import Console
+    from hyperplanes.commands.output.console import Console
     from hyperplanes.configuration.presets import Preset
     from hyperplanes.experiments.engine import Runner
-    from hyperplanes.experiments.experiment import Trained
-    from hyperplanes.experiments.scales import Scale
+    from hyperplanes.experiments.paper.experiment import Trained
+    from hyperplanes.experiments.paper.scales import Scale
     from hyperplanes.experiments.workers import Workers
     from hyperplanes.experiments.workspace import Workspace
     from hyperplanes.views import Tasks
@@ -30,7 +30,7 @@ def count_workers(asked: int | None, device: str) -> int:
         ValueError: less than one worker.
     """
     from hyperplanes.data.devices import choose_device
-    from hyperplanes.utilities.environment import usable_cores
+    from hyperplanes.utilities.machine.environment import usable_cores
 
     if asked is not None:
         if asked < 1:
@@ -56,7 +56,7 @@ def make_workers(count: int, out: Path, scale: Scale, device: str, **given: Any)
 
 def _worker_runner(out: Path, scale: Scale, device: str, **given: Any) -> Runner:
     """The runner of a worker process. It gets the folders of generated data sets with each piece of work."""
-    from hyperplanes.commands.console import Console
+    from hyperplanes.commands.output.console import Console
     from hyperplanes.experiments.workspace import Workspace
 
     console = Console(plain=True)

@@ -32,7 +32,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hyperplanes.commands.console import Bar, Console
 from hyperplanes.commands.options import (
     OptionalFolder,
     OptionalInt,
@@ -41,11 +40,12 @@ from hyperplanes.commands.options import (
     Protocol,
     optional,
 )
-from hyperplanes.commands.writing import writes_to
-from hyperplanes.utilities.formatting import format_duration, format_rate
-from hyperplanes.utilities.interrupts import SIGNALS, HungUp, listened_to
-from hyperplanes.utilities.processes import is_first_process
-from hyperplanes.utilities.shell import command_line
+from hyperplanes.commands.output.console import Bar, Console
+from hyperplanes.commands.output.writing import writes_to
+from hyperplanes.utilities.machine.interrupts import SIGNALS, HungUp, listened_to
+from hyperplanes.utilities.machine.processes import is_first_process
+from hyperplanes.utilities.messages.formatting import format_duration, format_rate
+from hyperplanes.utilities.messages.shell import command_line
 
 if TYPE_CHECKING:
     from hyperplanes.configuration.presets import Preset
@@ -199,8 +199,8 @@ def resolve(arguments: Arguments) -> Preset:
     """
     from hyperplanes.configuration.presets import preset
     from hyperplanes.configuration.settings_file import changed, parse_options, read_experiment
-    from hyperplanes.utilities.errors import prefix_errors
-    from hyperplanes.utilities.settings import SettingsError
+    from hyperplanes.utilities.files.settings import SettingsError
+    from hyperplanes.utilities.messages.errors import prefix_errors
 
     given = read_experiment(arguments.config) if arguments.config else {}
     chosen = preset(arguments.preset or given.get("preset", "quick"))
@@ -256,7 +256,7 @@ def _is_first(arguments: Arguments) -> bool:
 @writes_to(lambda arguments: arguments.out, _is_first)
 def run(arguments: Arguments) -> int:
     """Train from the start, or resume an interrupted training."""
-    from hyperplanes.training.distributed import ProcessEnded
+    from hyperplanes.training.parallel.distributed import ProcessEnded
 
     try:
         return _run(arguments)
@@ -273,10 +273,10 @@ def _run(arguments: Arguments) -> int:
     from hyperplanes.data.devices import choose_device
     from hyperplanes.data.support import WithSupport
     from hyperplanes.training import start_training
-    from hyperplanes.training.distributed import check_shares
     from hyperplanes.training.episodes.loader import reference_objects
-    from hyperplanes.training.launching import count_processes, launched
     from hyperplanes.training.monitoring import TensorBoard
+    from hyperplanes.training.parallel.distributed import check_shares
+    from hyperplanes.training.parallel.launching import count_processes, launched
 
     if arguments.out.resolve() in {path.resolve() for path in arguments.data}:
         raise ValueError(f"--out: expected a folder of its own, got {arguments.out}, which is --data; name another one")

@@ -27,12 +27,12 @@ from urllib.parse import urlsplit
 
 import tyro
 
-from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import bake_field, load_source, refuse_of_baked
+from hyperplanes.commands.inputs.fields import bake_field, load_source, refuse_of_baked
+from hyperplanes.commands.inputs.scene import prepare_task, read_scene
 from hyperplanes.commands.options import ViewsArguments
-from hyperplanes.commands.scene import prepare_task, read_scene
-from hyperplanes.utilities.formatting import counted
-from hyperplanes.utilities.interrupts import Terminated
+from hyperplanes.commands.output.console import Console
+from hyperplanes.utilities.machine.interrupts import Terminated
+from hyperplanes.utilities.messages.formatting import counted
 
 if TYPE_CHECKING:
     import torch
@@ -173,8 +173,8 @@ def _fields(
     """The number of steps done, after each step, with the field if it is to be shown after this step."""
     import torch
 
+    from hyperplanes.adaptation.correction.stacking import tuned_field
     from hyperplanes.adaptation.fine_tuning import average_of, make_descent
-    from hyperplanes.adaptation.stacking import tuned_field
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.parameters import Parameters
 
@@ -201,7 +201,7 @@ def _adapt(
     console: Console,
 ) -> None:
     """Show the field when it is adapted, while it is fine-tuned, and when it is baked."""
-    from hyperplanes.adaptation.canonical_frame import to_canonical_frame
+    from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
     from hyperplanes.adaptation.context import trained_on
     from hyperplanes.export.baking import BakedScene, default_side
 

@@ -7,7 +7,7 @@ from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.fields import Target, find_targets
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
-from hyperplanes.utilities.errors import did_you_mean
+from hyperplanes.utilities.messages.errors import did_you_mean
 
 __all__ = ["VOLUME_CHANNELS", "check_fine_tuning", "check_model", "check_training"]
 

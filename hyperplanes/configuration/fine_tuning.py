@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, TypeAlias
 
-from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.messages.arguments import checked_fields
 
 __all__ = ["AVERAGE", "CELLS", "FINE_VIEWS", "FRESH", "MANY_VIEWS", "RATES", "FineTuning", "Steps"]
 
@@ -36,7 +36,7 @@ MANY_VIEWS = 10
 """Support views from which on fine-tuning a field of any number of views begins with partly random weights, draws rays
 by contrast, and averages pictures with the visual hull; with fewer, each of the three loses as often as it gains
 (docs/small-training.md, docs/adaptation.md, docs/image-based.md). From this many views on, pictures are corrected too
-(`adaptation.residuals`)."""
+(`adaptation.correction.residuals`)."""
 
 
 @checked_fields

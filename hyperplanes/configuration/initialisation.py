@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 from hyperplanes.configuration.fine_tuning import FineTuning
-from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.messages.arguments import checked_fields
 
 __all__ = ["LEARNED", "InitialisationConfig"]
 

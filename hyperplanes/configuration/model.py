@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal
 
 from hyperplanes.configuration.initialisation import InitialisationConfig
 from hyperplanes.fields import TargetConfig, find_targets
-from hyperplanes.geometry.reflections import Symmetry
+from hyperplanes.geometry.symmetry.reflections import Symmetry
 from hyperplanes.hypernetwork import KINDS, AutoencoderConfig, HyperNetworkConfig, ImageHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
-from hyperplanes.utilities.arguments import checked_fields
-from hyperplanes.utilities.checkpoints import CheckpointError, read_json
-from hyperplanes.utilities.settings import SettingsError, choose_by_tag, flattened, structure, tagged
+from hyperplanes.utilities.files.checkpoints import CheckpointError, read_json
+from hyperplanes.utilities.files.settings import SettingsError, choose_by_tag, flattened, structure, tagged
+from hyperplanes.utilities.messages.arguments import checked_fields
 
 __all__ = ["ModelConfig"]
 
@@ -48,22 +48,23 @@ class ModelConfig:
             planes. With fewer views than planes, each view is then used for one plane and the other planes are masked,
             instead of filled with views from elsewhere.
         stacked: whether pictures of a field of any number of views are averaged with those of `hull_blend`. Of five or
-            more views, some are held out to decide the share (`adaptation.stacking`). Not used in training.
+            more views, some are held out to decide the share (`adaptation.correction.stacking`). Not used in training.
         hull_share: of `hull_blend` in pictures of a model that is not `stacked`, as decided for one object.
         gated: whether a gating network turns that share into one for each pixel (`adaptation.gating`);
             `training.gating` trains it after the model. With ten given views or more it also adds the hull to pictures
             after gradient steps.
         average: share, in pictures, of the field before gradient steps, in a model that these made for one object
             (`stacking.average`).
-        learned_steps: steps of gradient descent by a network after the forward pass (`adaptation.learned_steps`), half
-            as many from twenty views on; `training.learned_step` trains it after the model.
+        learned_steps: steps of gradient descent by a network after the forward pass
+            (`adaptation.optimisation.learned_steps`), half as many from twenty views on; `training.learned_step`
+            trains it after the model.
         residuals: whether pictures from ten views or more, unless these are large, are corrected by the residuals of
-            the views (`adaptation.residuals`).
+            the views (`adaptation.correction.residuals`).
         symmetric: whether reflections of the views of an object that looks symmetric are added to its views
-            (`adaptation.symmetry`). Not used in training.
+            (`adaptation.symmetry.detection`). Not used in training.
         symmetry: of the object, if it is known.
         azimuth: rotation of the object to its canonical frame, in radians, if it is known. Otherwise a `symmetric`
-            model looks for it (`adaptation.canonical_frame`).
+            model looks for it (`adaptation.alignment.canonical_frame`).
     """
 
     target: str = "point_multiplane"

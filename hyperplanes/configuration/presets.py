@@ -10,8 +10,8 @@ from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.fields import TARGETS, ImageBasedConfig, TargetConfig, find_targets
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig, VolumeHyperNetworkConfig
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.errors import did_you_mean
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.messages.errors import did_you_mean
 
 __all__ = ["PAPER_SAMPLING", "PRESETS", "PROTOCOLS", "TRAINABLE", "Preset", "preset"]
 

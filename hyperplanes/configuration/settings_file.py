@@ -21,11 +21,11 @@ from hyperplanes.configuration.presets import Preset
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.fields import find_targets
 from hyperplanes.hypernetwork import KINDS
-from hyperplanes.utilities.arguments import kind_of
-from hyperplanes.utilities.errors import nearest
-from hyperplanes.utilities.files import MALFORMED, DataError, read_bytes
-from hyperplanes.utilities.settings import SettingsError, structure
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.reading import MALFORMED, DataError, read_bytes
+from hyperplanes.utilities.files.settings import SettingsError, structure
+from hyperplanes.utilities.files.writing import write_whole
+from hyperplanes.utilities.messages.arguments import kind_of
+from hyperplanes.utilities.messages.errors import nearest
 
 __all__ = ["changed", "document", "parse_options", "read_experiment", "write_experiment"]
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.messages.arguments import checked_fields
 
 __all__ = ["TrainingConfig"]
 

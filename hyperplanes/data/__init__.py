@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 
 if TYPE_CHECKING:
     from hyperplanes.data.channels import mesh_path, read_channel

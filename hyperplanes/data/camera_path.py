@@ -19,11 +19,11 @@ import numpy.typing as npt
 import torch
 from kornia.geometry.camera import PinholeCamera
 
-from hyperplanes.data.formats.transforms_document import opencv_from_opengl
+from hyperplanes.data.formats.scenes.transforms_document import opencv_from_opengl
 from hyperplanes.data.pictures.posed import check_pose
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.files import DataError, read_json
+from hyperplanes.utilities.files.reading import DataError, read_json
+from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["CameraPath", "read_camera_path"]
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyperplanes.data.formats.npz import read_arrays
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.files import DataError
+from hyperplanes.data.formats.arrays import read_arrays
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["CHANNELS", "mesh_path", "read_channel"]
 

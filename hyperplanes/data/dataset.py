@@ -14,9 +14,9 @@ from hyperplanes.data.formats.recognise import find_catalogue, read_posed, read_
 from hyperplanes.data.pictures.posed import PosedTask
 from hyperplanes.data.upright import guess_up, upright, upright_task
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.files import DataError, malformed
-from hyperplanes.utilities.lru_cache import LRUCache
+from hyperplanes.utilities.files.reading import DataError, malformed
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
 
 __all__ = ["Dataset", "Datasets", "locate_scene", "open_dataset", "open_datasets", "read_task", "read_views"]

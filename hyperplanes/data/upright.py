@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 from hyperplanes.views import Task, Views
 
 __all__ = ["UPS", "guess_up", "stated_up", "upright", "upright_cameras", "upright_task", "y_up_from"]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from hyperplanes.adaptation.base import Pictures
 from hyperplanes.evaluation.scores import Score
 from hyperplanes.export.images import to_pixels
-from hyperplanes.utilities.plots import draw_boxes, draw_grid, draw_lines, new_figure, save_figure, set_counts
+from hyperplanes.utilities.images.plots import draw_boxes, draw_grid, draw_lines, new_figure, save_figure, set_counts
 from hyperplanes.views import Task
 
 __all__ = ["PictureGrid", "save_boxes", "save_curves"]

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from hyperplanes.evaluation.scores import ObjectScore
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.writing import write_json
 
 __all__ = ["PartialResults"]
 

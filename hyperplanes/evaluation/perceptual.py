@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from hyperplanes.utilities.checkpoints import check_tensors, load_tensors
+from hyperplanes.utilities.files.checkpoints import check_tensors, load_tensors
 
 __all__ = ["LPIPS"]
 

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import Adapter, Pictures, Renderable
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.errors import prefix_errors
-from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
-from hyperplanes.utilities.timing import clock
+from hyperplanes.utilities.images.metrics import foreground_psnr, pooled_psnr, psnr, ssim
+from hyperplanes.utilities.machine.timing import clock
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.messages.errors import prefix_errors
 from hyperplanes.views import Task, Tasks
 
 __all__ = ["QUANTITIES", "ObjectScore", "Perceptual", "Score", "evaluate", "evaluate_all", "merge_seeds"]

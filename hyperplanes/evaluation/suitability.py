@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 
 from hyperplanes.adaptation.base import Renderable
+from hyperplanes.adaptation.baselines.nearest_view import NearestView
 from hyperplanes.adaptation.context import observe
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.nearest_view import NearestView
 from hyperplanes.adaptation.network import in_use
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
 
 __all__ = ["FEWEST_VIEWS", "held_out_psnr", "suitability_warnings", "worse_than_copying"]

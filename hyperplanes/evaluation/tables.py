@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from hyperplanes.evaluation.comparison import Comparison
 from hyperplanes.evaluation.scores import QUANTITIES, Score
-from hyperplanes.utilities.formatting import format_duration
-from hyperplanes.utilities.tables import csv_table, markdown_table
+from hyperplanes.utilities.files.tables import csv_table, markdown_table
+from hyperplanes.utilities.messages.formatting import format_duration
 
 __all__ = ["PAIR_HEADINGS", "as_csv", "as_json", "as_markdown", "compared_rows", "headings", "rows"]
 

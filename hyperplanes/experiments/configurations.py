@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 from hyperplanes.configuration.fine_tuning import RATES
 from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.configuration.presets import Preset, preset
-from hyperplanes.experiments.experiment import Experiment, Trained
-from hyperplanes.experiments.published import SOURCES
-from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.paper.experiment import Experiment, Trained
+from hyperplanes.experiments.paper.published import SOURCES
+from hyperplanes.experiments.paper.scales import Scale
 
 __all__ = ["DIFFERENCE_HEADINGS", "Difference", "change", "configuration", "differences", "scaled_preset"]
 

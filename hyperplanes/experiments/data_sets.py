@@ -13,9 +13,9 @@ import torch
 from hyperplanes.data import open_dataset
 from hyperplanes.data.devices import TasksOnDevice
 from hyperplanes.data.support import WithBounds
-from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.paper.scales import Scale
 from hyperplanes.experiments.workspace import Workspace, unique_name
-from hyperplanes.utilities.files import folder_checksum
+from hyperplanes.utilities.files.reading import folder_checksum
 from hyperplanes.views import Tasks
 
 __all__ = ["DataSets"]

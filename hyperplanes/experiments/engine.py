@@ -20,17 +20,17 @@ from hyperplanes.data.support import Shown, WithSupport
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.experiments.configurations import scaled_preset
 from hyperplanes.experiments.data_sets import DataSets
-from hyperplanes.experiments.experiment import Cell, Experiment
+from hyperplanes.experiments.paper.experiment import Cell, Experiment
+from hyperplanes.experiments.paper.scales import Scale
 from hyperplanes.experiments.record import plain
-from hyperplanes.experiments.scales import Scale
 from hyperplanes.experiments.trainings import Train, Trainings
 from hyperplanes.experiments.workers import Result, Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.export.images import orbit_cameras, picture_paths, save_images
 from hyperplanes.methods import Request, Unchecked, make_method
-from hyperplanes.utilities.checkpoints import read_json
-from hyperplanes.utilities.environment import find_processor
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.checkpoints import read_json
+from hyperplanes.utilities.files.writing import write_json
+from hyperplanes.utilities.machine.environment import find_processor
 from hyperplanes.views import Task, Tasks
 
 __all__ = ["ORBIT", "Curve", "OnScore", "Outcome", "Runner", "curve_of", "file_name"]

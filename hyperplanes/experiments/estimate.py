@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.experiments.engine import Runner
-from hyperplanes.experiments.experiment import Experiment, Trained
+from hyperplanes.experiments.paper.experiment import Experiment, Trained
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.training import Trainer
 from hyperplanes.training.initialisation import initialisation_trainer
-from hyperplanes.utilities.formatting import format_duration, format_rate
-from hyperplanes.utilities.timing import clock
+from hyperplanes.utilities.machine.timing import clock
+from hyperplanes.utilities.messages.formatting import format_duration, format_rate
 
 __all__ = ["Estimate", "estimate"]
 

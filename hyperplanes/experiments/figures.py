@@ -10,7 +10,7 @@ import numpy as np
 
 from hyperplanes.experiments.engine import Curve, Outcome, Runner
 from hyperplanes.experiments.report import value
-from hyperplanes.utilities.plots import draw_bars, draw_boxes, draw_grid, draw_lines, new_figure
+from hyperplanes.utilities.images.plots import draw_bars, draw_boxes, draw_grid, draw_lines, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hyperplanes.utilities.checkpoints import CheckpointError, read_json
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.checkpoints import CheckpointError, read_json
+from hyperplanes.utilities.files.writing import write_json
 
 __all__ = ["Record", "plain"]
 

@@ -12,10 +12,10 @@ from hyperplanes.configuration.initialisation import LEARNED
 from hyperplanes.evaluation import Score
 from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS, differences
 from hyperplanes.experiments.engine import Outcome
-from hyperplanes.experiments.experiment import Cell
-from hyperplanes.experiments.published import SOURCES
-from hyperplanes.utilities.environment import environment
-from hyperplanes.utilities.tables import csv_table, markdown_table
+from hyperplanes.experiments.paper.experiment import Cell
+from hyperplanes.experiments.paper.published import SOURCES
+from hyperplanes.utilities.files.tables import csv_table, markdown_table
+from hyperplanes.utilities.machine.environment import environment
 
 __all__ = ["as_csv", "as_json", "as_markdown", "headings", "rows", "settings", "sources", "value", "what_differs"]
 

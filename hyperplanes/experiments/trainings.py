@@ -15,7 +15,7 @@ from hyperplanes.configuration.presets import Preset
 from hyperplanes.data.support import WithSupport
 from hyperplanes.experiments.configurations import configuration
 from hyperplanes.experiments.data_sets import DataSets
-from hyperplanes.experiments.experiment import Experiment, Trained
+from hyperplanes.experiments.paper.experiment import Experiment, Trained
 from hyperplanes.experiments.workers import Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.views import Tasks

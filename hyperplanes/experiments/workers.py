@@ -19,7 +19,7 @@ from typing import Any, Protocol, Self, TypeVar
 import torch
 
 from hyperplanes.experiments.data_sets import DataSets
-from hyperplanes.utilities.interrupts import interruptible
+from hyperplanes.utilities.machine.interrupts import interruptible
 
 __all__ = ["Result", "Workers"]
 

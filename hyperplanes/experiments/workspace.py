@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hyperplanes.experiments.record import Record, plain
-from hyperplanes.utilities.encoding import encode_json
+from hyperplanes.utilities.files.encoding import encode_json
 
 __all__ = ["Workspace", "unique_name"]
 

@@ -25,7 +25,7 @@ from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.rendering.scene import SplitField
 from hyperplanes.rendering.transmittance import transmittance
 from hyperplanes.rendering.voxels import STOP, VoxelGrid, render_voxels, shade_voxels
-from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["BakedScene", "bake", "coarsening", "default_side"]
 

@@ -23,12 +23,12 @@ from hyperplanes.export.animation import choose_representation
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.occupancy import carve
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.errors import MissingPackageError
-from hyperplanes.utilities.files import format_of
-from hyperplanes.utilities.image_range import check_image_range
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.encoding import encode_png
+from hyperplanes.utilities.files.reading import format_of
+from hyperplanes.utilities.files.writing import write_whole
+from hyperplanes.utilities.images.image_range import check_image_range
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.messages.errors import MissingPackageError
 from hyperplanes.views import Views
 
 __all__ = [

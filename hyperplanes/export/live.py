@@ -20,7 +20,7 @@ from hyperplanes.adaptation.base import Renderable
 from hyperplanes.export.images import orbit_cameras, to_pixels, upward
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.rendering.images import Pictures
-from hyperplanes.utilities.errors import MissingPackageError
+from hyperplanes.utilities.messages.errors import MissingPackageError
 from hyperplanes.views import Views
 
 __all__ = ["LiveViewer", "beside", "require_viewer", "viewed_camera"]

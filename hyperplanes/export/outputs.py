@@ -12,9 +12,9 @@ from kornia.geometry.camera import PinholeCamera
 from hyperplanes.export.images import picture_paths, to_pixels
 from hyperplanes.rendering.depth import seen_surface
 from hyperplanes.rendering.images import Pictures
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.writing import write_json, write_whole
+from hyperplanes.utilities.files.encoding import encode_png
+from hyperplanes.utilities.files.writing import write_json, write_whole
+from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["OUTPUTS", "depth_pixels", "output_frames", "save_outputs"]
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels, upward
 from hyperplanes.fields.baked import HARMONICS, BakedField
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.writing import write_whole
 from hyperplanes.views import Views
 
 __all__ = ["AROUND", "LARGEST", "address_of", "page_of", "save_page", "turning_picture"]

@@ -20,10 +20,10 @@ from hyperplanes.fields.baked import HARMONICS, BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.rendering.splats import render_splats
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.files import format_of
-from hyperplanes.utilities.uncompiled_optimisers import Adam
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.reading import format_of
+from hyperplanes.utilities.files.writing import write_whole
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.uncompiled_optimisers import Adam
 from hyperplanes.views import Views, join_views
 
 __all__ = ["SPLAT_FORMATS", "Splats", "fit_splats", "save_splats", "splats_of"]

@@ -16,7 +16,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Rays, join_rays
 from hyperplanes.rendering.images import EDGE_SUBPIXELS, pixels_at_edges
 from hyperplanes.rendering.voxels import voxel_gradients
-from hyperplanes.utilities.uncompiled_optimisers import Adam
+from hyperplanes.utilities.tensors.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
 
 __all__ = ["STEPS", "fit_voxels", "render_guide"]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.checkpoints import CheckpointError, load_tensors, save_tensors
+from hyperplanes.utilities.files.checkpoints import CheckpointError, load_tensors, save_tensors
 
 __all__ = ["HARMONICS", "LARGEST_SIDE", "BakedField", "spherical_harmonics"]
 

@@ -20,9 +20,9 @@ from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.parameters import Parameters
-from hyperplanes.utilities.arguments import checked_fields
-from hyperplanes.utilities.kept import kept
-from hyperplanes.utilities.transforms import wants_values_alone
+from hyperplanes.utilities.messages.arguments import checked_fields
+from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.transforms import wants_values_alone
 from hyperplanes.views import Views
 
 __all__ = ["Field", "MLPField", "Target", "TargetConfig"]

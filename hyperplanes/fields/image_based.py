@@ -23,12 +23,12 @@ from hyperplanes.geometry.chosen_views import ChosenViews, Described, Reading, V
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, resampled_grid, volume_of
 from hyperplanes.parameters import Parameters
-from hyperplanes.utilities.arguments import checked_fields
-from hyperplanes.utilities.kept import kept
-from hyperplanes.utilities.transforms import wants_values_alone
+from hyperplanes.utilities.messages.arguments import checked_fields
+from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.transforms import wants_values_alone
 from hyperplanes.views import Views
 
 __all__ = ["ImageBasedConfig", "ImageBasedField", "ImageBasedNeRF", "FeatureGrid"]

@@ -4,7 +4,7 @@ from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.lookup import Lookup, sample
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Rays, Sphere, cast
-from hyperplanes.geometry.reflections import Plane, Symmetry, reflected_cameras
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry, reflected_cameras
 
 __all__ = [
     "ImagePlanes",

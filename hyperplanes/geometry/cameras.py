@@ -20,8 +20,8 @@ from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.inputs import Selection, as_selection, check_precision
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.poses import fibonacci_sphere, look_at, opencv_from_opengl, opengl_from_opencv, orbit
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.precision import without_autocast
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.precision import without_autocast
 
 __all__ = [
     "camera_from_world",

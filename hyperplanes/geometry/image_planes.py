@@ -27,10 +27,10 @@ from hyperplanes.geometry.lookup import Lookup, choose, lookup
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.packed_images import PackedImages, pack
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.kept import kept
-from hyperplanes.utilities.precision import without_autocast
-from hyperplanes.utilities.transforms import are_plain
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.precision import without_autocast
+from hyperplanes.utilities.tensors.transforms import are_plain
 
 __all__ = ["MIN_Z", "ImagePlanes", "Lookup"]
 

@@ -21,8 +21,8 @@ from hyperplanes.geometry.inputs import (
 )
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.packed_images import PackedImages
-from hyperplanes.utilities.arguments import kind_of
-from hyperplanes.utilities.transforms import transform_of
+from hyperplanes.utilities.messages.arguments import kind_of
+from hyperplanes.utilities.tensors.transforms import transform_of
 
 __all__ = ["Backend", "Lookup", "backends", "choose", "lookup", "sample"]
 
@@ -151,7 +151,7 @@ def lookup(
         return Lookup(*lookup_torch.lookup(points, matrices, images, views, background, nearest))
     if backend is not None:
         _check(backend, points.device)
-    from hyperplanes.geometry.kernels import operators
+    from hyperplanes.geometry.kernels.lookup import operators
 
     fits = packed is not None and points.dtype == torch.float32 and not images.requires_grad
     words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)
@@ -216,7 +216,7 @@ def sample(
         raise ValueError(
             f"backend: expected {'torch' if fastest != 'cpu' else 'torch or cpu'} for {taken}, got {name!r}"
         )
-    from hyperplanes.geometry.kernels import operators
+    from hyperplanes.geometry.kernels.lookup import operators
 
     fits = packed is not None and coordinates.element_size() == 4 and not images.requires_grad
     words, bits = (packed.words, packed.bits) if packed is not None and fits else (None, 0)

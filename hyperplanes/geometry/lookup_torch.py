@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from hyperplanes.utilities.transforms import transform_of
+from hyperplanes.utilities.tensors.transforms import transform_of
 
 __all__ = ["BORDER", "MIN_Z", "interpolate", "lookup", "place", "project", "sample"]
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.files.encoding import encode_png
 
 __all__ = ["show_views"]
 

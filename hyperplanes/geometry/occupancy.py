@@ -19,10 +19,10 @@ from hyperplanes.geometry.inputs import ArrayLike, as_images
 from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.arguments import checked, kind_of
-from hyperplanes.utilities.kept import kept
-from hyperplanes.utilities.precision import without_autocast
-from hyperplanes.utilities.transforms import are_plain
+from hyperplanes.utilities.messages.arguments import checked, kind_of
+from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.precision import without_autocast
+from hyperplanes.utilities.tensors.transforms import are_plain
 
 __all__ = ["Occupancy", "ball_extent", "carve", "dilate", "full", "ranges"]
 
@@ -221,7 +221,7 @@ def _carve_compiled(masks: Tensor, matrices: Tensor, calibrations: Tensor, given
     corner = np.asarray(given.bounds.centre, np.float32) - np.float32(given.bounds.radius)
     numbers = [np.float32(value) for value in (given.voxel, given.voxel * math.sqrt(3) / 2, _min_z(given), votes)]
     fixed = (matrices.contiguous().numpy(), calibrations.contiguous().numpy(), tables, corner, *numbers)
-    kernel, occupied = compile_kernel("carving.carve", torch.float32), given.occupied.numpy().astype(np.uint8, "C")
+    kernel, occupied = compile_kernel("hull.carving.carve", torch.float32), given.occupied.numpy().astype(np.uint8, "C")
     parallel_for(lambda start, stop: kernel(*fixed, occupied, start, stop), len(occupied), 2)
     return torch.from_numpy(occupied.view(np.bool_))
 

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hyperplanes.utilities.arguments import checked
 from hyperplanes.utilities.axes import flip_camera_axes
-from hyperplanes.utilities.precision import without_autocast
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.precision import without_autocast
 
 __all__ = [
     "farthest_first",

@@ -13,8 +13,8 @@ from torch import Tensor
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera, undistorted_pixels
 from hyperplanes.geometry.inputs import ArrayLike, as_tensor, check_indices
-from hyperplanes.utilities.arguments import checked, checked_fields, kind_of
-from hyperplanes.utilities.precision import without_autocast
+from hyperplanes.utilities.messages.arguments import checked, checked_fields, kind_of
+from hyperplanes.utilities.tensors.precision import without_autocast
 
 __all__ = ["SUBPIXELS", "Rays", "Sphere", "cast", "join_rays", "pixel_grid"]
 

@@ -9,7 +9,7 @@ from torch.nn.functional import adaptive_avg_pool3d, grid_sample, interpolate
 
 from hyperplanes.geometry.chosen_views import Reading
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 
 __all__ = ["CHANNELS", "SIDE", "interpolate_grid", "resampled_grid", "volume_of"]
 

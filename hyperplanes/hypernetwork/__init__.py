@@ -1,6 +1,5 @@
 """Hypernetworks: from images or a volume of an object to an update of the weights of a target network."""
 
-from hyperplanes.hypernetwork.autoencoder import Autoencoder, AutoencoderConfig
 from hyperplanes.hypernetwork.base import HyperNetwork, Observed
 from hyperplanes.hypernetwork.configuration import (
     KINDS,
@@ -9,9 +8,10 @@ from hyperplanes.hypernetwork.configuration import (
     VolumeHyperNetworkConfig,
 )
 from hyperplanes.hypernetwork.encoders import ConvNet, ResNet101
-from hyperplanes.hypernetwork.image_hypernetwork import ImageHyperNetwork
+from hyperplanes.hypernetwork.images.autoencoder import Autoencoder, AutoencoderConfig
+from hyperplanes.hypernetwork.images.image_hypernetwork import ImageHyperNetwork
 from hyperplanes.hypernetwork.learned_step import LearnedStep
-from hyperplanes.hypernetwork.volume_hypernetwork import VolumeHyperNetwork
+from hyperplanes.hypernetwork.volume.volume_hypernetwork import VolumeHyperNetwork
 
 __all__ = [
     "KINDS",

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import relu, silu
 
 from hyperplanes.hypernetwork.encoders import Choice, Encoder, Normalisation
-from hyperplanes.utilities.arguments import checked_fields
+from hyperplanes.utilities.messages.arguments import checked_fields
 
 __all__ = [
     "ACTIVATIONS",

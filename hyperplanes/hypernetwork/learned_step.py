@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hyperplanes.hypernetwork.volume_network import VolumeNetwork
+from hyperplanes.hypernetwork.volume.volume_network import VolumeNetwork
 
 __all__ = ["LearnedStep"]
 

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import torch
 
-from hyperplanes.hypernetwork.autoencoder import Autoencoder, AutoencoderConfig
 from hyperplanes.hypernetwork.base import HyperNetwork
 from hyperplanes.hypernetwork.configuration import HyperNetworkConfig, VolumeHyperNetworkConfig
-from hyperplanes.hypernetwork.image_hypernetwork import ImageHyperNetwork
-from hyperplanes.hypernetwork.volume_hypernetwork import VolumeHyperNetwork
+from hyperplanes.hypernetwork.images.autoencoder import Autoencoder, AutoencoderConfig
+from hyperplanes.hypernetwork.images.image_hypernetwork import ImageHyperNetwork
+from hyperplanes.hypernetwork.volume.volume_hypernetwork import VolumeHyperNetwork
 
 __all__ = ["make_hypernetwork"]
 

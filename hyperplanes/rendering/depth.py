@@ -13,7 +13,7 @@ from torch.nn.functional import normalize, pad
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import cast, pixel_grid
 from hyperplanes.rendering.images import Pictures
-from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["SeenSurface", "seen_surface"]
 

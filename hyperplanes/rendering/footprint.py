@@ -18,8 +18,8 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy, ball_extent
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.precision import without_autocast
-from hyperplanes.utilities.transforms import are_plain
+from hyperplanes.utilities.tensors.precision import without_autocast
+from hyperplanes.utilities.tensors.transforms import are_plain
 
 __all__ = ["footprint", "pixels_across"]
 
@@ -58,7 +58,7 @@ def footprint(occupancy: Occupancy, cameras: PinholeCamera) -> Bool[Tensor, "vie
 
 def _mark_compiled(seen: Tensor, points: Tensor, matrices: Tensor, calibrations: Tensor, voxel: float) -> None:
     """Sets the pixels of `seen` around surface voxels with these centres, by the compiled kernel."""
-    kernel = compile_kernel("footprints.footprints", points.dtype)
+    kernel = compile_kernel("hull.footprints.footprints", points.dtype)
     fixed = [each.contiguous().numpy() for each in (points, matrices, calibrations)]
     numbers = np.asarray([voxel * math.sqrt(3) / 2, 2 * voxel], fixed[0].dtype)
     parallel_for(lambda start, stop: kernel(*fixed, *numbers, seen.numpy(), start, stop), len(seen), 1)

@@ -16,7 +16,7 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import footprint
-from hyperplanes.utilities.memory import require_memory
+from hyperplanes.utilities.machine.memory import require_memory
 
 __all__ = ["EDGE_SUBPIXELS", "Pictures", "join_pictures", "pixels_at_edges", "render_images"]
 

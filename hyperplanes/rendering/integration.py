@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.rendering.compositing import Rendered, composite, composite_packed, packed_weights
-from hyperplanes.rendering.samplers import DenseSamples, OpaqueSamples, PackedSamples, Sampler
+from hyperplanes.rendering.sampling.samplers import DenseSamples, OpaqueSamples, PackedSamples, Sampler
 from hyperplanes.rendering.scene import (
     FieldFunction,
     Scene,

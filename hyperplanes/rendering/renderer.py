@@ -17,13 +17,13 @@ from hyperplanes.geometry.poses import Count
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import pixels_across
-from hyperplanes.rendering.hierarchical import Hierarchical
 from hyperplanes.rendering.images import Pictures, render_images
 from hyperplanes.rendering.integration import integrate
-from hyperplanes.rendering.marching import RayMarching
-from hyperplanes.rendering.samplers import Sampler
+from hyperplanes.rendering.sampling.hierarchical import Hierarchical
+from hyperplanes.rendering.sampling.marching import RayMarching
+from hyperplanes.rendering.sampling.samplers import Sampler
 from hyperplanes.rendering.scene import FieldFunction, Scene
-from hyperplanes.utilities.arguments import checked
+from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["FieldFunction", "Hierarchical", "RayMarching", "Sampler", "allow_tf32", "render"]
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.utilities.arguments import kind_of
+from hyperplanes.utilities.messages.arguments import kind_of
 
 __all__ = [
     "FieldFunction",

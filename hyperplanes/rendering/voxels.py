@@ -12,9 +12,9 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import pad
 
-from hyperplanes.geometry.kernels import voxel_rays
 from hyperplanes.geometry.kernels.compiling import compile_function
 from hyperplanes.geometry.kernels.threads import parallel_for
+from hyperplanes.geometry.kernels.voxels import voxel_rays
 from hyperplanes.geometry.occupancy import ranges
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered

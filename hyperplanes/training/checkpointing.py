@@ -22,15 +22,21 @@ from torch import Tensor
 
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
-from hyperplanes.adaptation.optimisers import Muon
+from hyperplanes.adaptation.optimisation.optimisers import Muon
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes import EpisodeLoader
 from hyperplanes.training.optimisation import Optimisation
-from hyperplanes.utilities.checkpoints import CheckpointError, check_tensors, load_tensors, read_json, save_tensors
-from hyperplanes.utilities.encoding import encode_json
-from hyperplanes.utilities.environment import has_fast_bfloat16
-from hyperplanes.utilities.files import malformed
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.checkpoints import (
+    CheckpointError,
+    check_tensors,
+    load_tensors,
+    read_json,
+    save_tensors,
+)
+from hyperplanes.utilities.files.encoding import encode_json
+from hyperplanes.utilities.files.reading import malformed
+from hyperplanes.utilities.files.writing import write_json
+from hyperplanes.utilities.machine.environment import has_fast_bfloat16
 
 __all__ = ["Checkpointing", "choose_precision"]
 

@@ -17,7 +17,7 @@ from hyperplanes.parameters import Parameters
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.training.episodes import Draw, Episode
 from hyperplanes.training.episodes.augmentation import drop_planes, over_random_colour
-from hyperplanes.utilities.errors import prefix_errors
+from hyperplanes.utilities.messages.errors import prefix_errors
 
 __all__ = ["ForwardOutput", "forward"]
 

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
+from hyperplanes.adaptation.correction.held_out import hold_out
+from hyperplanes.adaptation.correction.stacking import hull_field, hull_share
 from hyperplanes.adaptation.gating import GatingNetwork, readings
-from hyperplanes.adaptation.held_out import hold_out
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.stacking import hull_field, hull_share
-from hyperplanes.utilities.seeding import seeded
+from hyperplanes.utilities.tensors.seeding import seeded
 from hyperplanes.views import Task, moved
 
 __all__ = ["GatingExample", "example_of", "fit_gate", "turned"]

@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 from torch.optim import Adam
 
-from hyperplanes.adaptation.gradients import summed_gradients
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.learned_steps import step_inputs
 from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork, in_use
+from hyperplanes.adaptation.optimisation.gradients import summed_gradients
+from hyperplanes.adaptation.optimisation.learned_steps import step_inputs
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.hypernetwork import LearnedStep
 from hyperplanes.parameters import Parameters
-from hyperplanes.training.distributed import Processes
 from hyperplanes.training.episodes import Draw, EpisodeLoader
 from hyperplanes.training.forward import forward
 from hyperplanes.training.losses import photometric_loss
-from hyperplanes.utilities.seeding import seeded
+from hyperplanes.training.parallel.distributed import Processes
+from hyperplanes.utilities.tensors.seeding import seeded
 from hyperplanes.views import Tasks
 
 __all__ = ["fit_learned_step"]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.profiler import record_function
 
-from hyperplanes.adaptation.descent import ray_loss
+from hyperplanes.adaptation.optimisation.descent import ray_loss
 from hyperplanes.configuration.compatibility import VOLUME_CHANNELS
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry.rays import Sphere

@@ -15,9 +15,9 @@ from torch import Tensor
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.export.images import to_pixels
-from hyperplanes.utilities.metrics import ssim
-from hyperplanes.utilities.tables import csv_table
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.tables import csv_table
+from hyperplanes.utilities.files.writing import write_whole
+from hyperplanes.utilities.images.metrics import ssim
 
 __all__ = ["Progress", "Samples", "Speed", "TensorBoard", "gradient_norms", "write_curve"]
 

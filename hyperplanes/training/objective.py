@@ -12,8 +12,8 @@ from torch.profiler import record_function
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.adaptation.gradients import sum_present, summed_gradients
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.optimisation.gradients import sum_present, summed_gradients
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.parameters import Parameters

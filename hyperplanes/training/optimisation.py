@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.optimisers import make_optimisers
+from hyperplanes.adaptation.optimisation.optimisers import make_optimisers
 from hyperplanes.configuration.training import TrainingConfig
 
 __all__ = ["Optimisation"]

@@ -11,12 +11,12 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.data.devices import TasksOnDevice
-from hyperplanes.training.distributed import Processes
 from hyperplanes.training.initialisation import initialisation_trainer
+from hyperplanes.training.parallel.distributed import Processes
 from hyperplanes.training.trainer import Trainer
-from hyperplanes.utilities.checkpoints import read_json
-from hyperplanes.utilities.encoding import sha256
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.checkpoints import read_json
+from hyperplanes.utilities.files.encoding import sha256
+from hyperplanes.utilities.files.writing import write_json
 from hyperplanes.views import Tasks
 
 __all__ = ["start_training"]

@@ -15,17 +15,17 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.compatibility import check_training
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.checkpointing import Checkpointing, choose_precision
-from hyperplanes.training.distributed import ProcessEnded, Processes, check_shares, other_processes
 from hyperplanes.training.episodes import EpisodeLoader
 from hyperplanes.training.episodes.loader import reference_objects, training_names
 from hyperplanes.training.monitoring import Progress, Samples, Speed, gradient_norms, write_curve
 from hyperplanes.training.objective import Objective, RenderingObjective
 from hyperplanes.training.optimisation import Optimisation
+from hyperplanes.training.parallel.distributed import ProcessEnded, Processes, check_shares, other_processes
 from hyperplanes.training.validation import Validation, Validator
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.errors import prefix_errors
-from hyperplanes.utilities.writing import write_whole
+from hyperplanes.utilities.files.encoding import encode_png
+from hyperplanes.utilities.files.writing import write_whole
+from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.messages.errors import prefix_errors
 from hyperplanes.views import Tasks
 
 __all__ = ["Trainer", "train"]

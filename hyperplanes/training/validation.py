@@ -16,7 +16,7 @@ from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.training.episodes.episode import Episode, prepare_episode
 from hyperplanes.training.episodes.loader import reads_hull
 from hyperplanes.training.monitoring import Samples
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Tasks
 
 __all__ = ["Validation", "Validator"]

@@ -8,8 +8,8 @@ import torch
 
 from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.descent import Descent
 from hyperplanes.adaptation.fine_tuned import FromScratch
+from hyperplanes.adaptation.optimisation.descent import Descent
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.fine_tuning import FRESH, MANY_VIEWS, FineTuning
 from hyperplanes.fields import ImageBasedConfig, TargetConfig
@@ -19,7 +19,7 @@ from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig,
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import RayMarching
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring
 
 SHAPE = ImageHyperNetworkConfig(

@@ -6,15 +6,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hyperplanes.adaptation import HyperPlanes, descent
+from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.context import trained_on
-from hyperplanes.adaptation.descent import split_holdout
+from hyperplanes.adaptation.correction.stacking import AveragedField
 from hyperplanes.adaptation.fine_tuned import FromScratch
 from hyperplanes.adaptation.fine_tuning import fine_tune_to, made_anyway, make_descent
-from hyperplanes.adaptation.learned_steps import updated_weights
-from hyperplanes.adaptation.stacking import AveragedField
+from hyperplanes.adaptation.optimisation import descent
+from hyperplanes.adaptation.optimisation.descent import split_holdout
+from hyperplanes.adaptation.optimisation.learned_steps import updated_weights
 from hyperplanes.configuration.fine_tuning import AVERAGE, MANY_VIEWS, FineTuning
-from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from tests.adaptation.test_learned_steps import stepping
 from tests.reference_rendering import ball_views, ring
 

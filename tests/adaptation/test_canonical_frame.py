@@ -7,26 +7,27 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig, canonical_frame
-from hyperplanes.adaptation.canonical_frame import FEWEST, GAIN, MOST, find_rotation, to_canonical_frame
-from hyperplanes.adaptation.descent import Descent, split_holdout
+from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig
+from hyperplanes.adaptation.alignment import canonical_frame
+from hyperplanes.adaptation.alignment.canonical_frame import FEWEST, GAIN, MOST, find_rotation, to_canonical_frame
+from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
+from hyperplanes.adaptation.correction.stacking import StackedField
 from hyperplanes.adaptation.fine_tuning import NoProgressError, made_anyway
-from hyperplanes.adaptation.reflections import reflected
-from hyperplanes.adaptation.rotation import RotatedField, Rotation
-from hyperplanes.adaptation.stacking import StackedField
+from hyperplanes.adaptation.optimisation.descent import Descent, split_holdout
 from hyperplanes.adaptation.swapped import Swapped
-from hyperplanes.commands.console import Console
-from hyperplanes.commands.fields import adapt_to
+from hyperplanes.adaptation.symmetry.reflections import reflected
+from hyperplanes.commands.inputs.fields import adapt_to
+from hyperplanes.commands.output.console import Console
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
-from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.methods import WithSampler
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.rendering.scene import SplitField
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from tests.adaptation.test_stacking import CONFIG
 from tests.adaptation.test_symmetry import ACROSS, BODY, SMALL, balls, cameras, model
 from tests.reference_rendering import ring

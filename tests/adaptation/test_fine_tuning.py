@@ -10,11 +10,11 @@ import torch
 from torch.nn.functional import max_pool2d
 
 from hyperplanes.adaptation import AdaptedField, fine_tuning
-from hyperplanes.adaptation import descent as descent_module
-from hyperplanes.adaptation.descent import contrast, draw_pixels, ray_loss, split_holdout
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.optimisation import descent as descent_module
+from hyperplanes.adaptation.optimisation.descent import contrast, draw_pixels, ray_loss, split_holdout
 from hyperplanes.configuration.fine_tuning import FINE_VIEWS, MANY_VIEWS, FineTuning
 from hyperplanes.fields import ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.fields.base import Field
@@ -25,7 +25,7 @@ from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.rendering.compositing import Rendered
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from tests.reference_rendering import awaken, ball_views, ring, small_model
 
 PAPER = FineTuning(trainable="hypernetwork", rays=64, learning_rate=1e-2)

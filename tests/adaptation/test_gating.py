@@ -7,19 +7,19 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import CorrectedField, HullBlend, HyperPlanes
-from hyperplanes.adaptation.descent import Descent
+from hyperplanes.adaptation.correction.held_out import FEWEST
+from hyperplanes.adaptation.correction.stacking import AveragedField, StackedField, stack
 from hyperplanes.adaptation.fine_tuning import fine_tune_to
 from hyperplanes.adaptation.gating import GatingNetwork, readings
-from hyperplanes.adaptation.held_out import FEWEST
-from hyperplanes.adaptation.stacking import AveragedField, StackedField, stack
+from hyperplanes.adaptation.optimisation.descent import Descent
 from hyperplanes.commands import view
-from hyperplanes.commands.console import Console
+from hyperplanes.commands.output.console import Console
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.geometry.rays import cast
-from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.training import gating
 from hyperplanes.training.gating import GatingExample, example_of, fit_gate, turned
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task
 from tests.adaptation.test_stacking import CONFIG, both, model
 from tests.reference_rendering import ball_views, ring

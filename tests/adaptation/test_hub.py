@@ -15,7 +15,7 @@ import torch
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.fields.base import TargetConfig
-from hyperplanes.utilities.checkpoints import CheckpointError
+from hyperplanes.utilities.files.checkpoints import CheckpointError
 
 
 @pytest.fixture

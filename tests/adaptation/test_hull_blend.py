@@ -6,16 +6,18 @@ import pytest
 import torch
 from torch.nn.functional import max_pool2d
 
-from hyperplanes.adaptation import HullBlend, hull_blend
+from hyperplanes.adaptation import HullBlend
 from hyperplanes.adaptation.base import hull
-from hyperplanes.geometry import Sphere, against
+from hyperplanes.adaptation.baselines import hull_blend
+from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
 from hyperplanes.geometry.chosen_views import ANGLE
-from hyperplanes.geometry.hull_hits import centres_in_hull
 from hyperplanes.geometry.occupancy import Occupancy, full
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility import penalties as against
+from hyperplanes.geometry.visibility.hull_hits import centres_in_hull
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.rendering import RayMarching
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
 from tests.reference_rendering import ball_views, camera_at, ring
 

@@ -17,7 +17,7 @@ from hyperplanes.geometry.cameras import intrinsics as calibration
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical
-from hyperplanes.utilities.checkpoints import CheckpointError
+from hyperplanes.utilities.files.checkpoints import CheckpointError
 from hyperplanes.views import Views
 from tests.reference_rendering import awaken, ball_views, ring, small_model
 

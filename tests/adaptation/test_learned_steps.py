@@ -6,12 +6,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HyperPlanes, learned_steps
-from hyperplanes.adaptation.learned_steps import PARTS, grid_gradient, take_learned_steps, updated_weights
+from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.network import GRID
+from hyperplanes.adaptation.optimisation import learned_steps
+from hyperplanes.adaptation.optimisation.learned_steps import PARTS, grid_gradient, take_learned_steps, updated_weights
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.configuration.training import TrainingConfig
-from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.training import learned_step as training
 from hyperplanes.training.learned_step import fit_learned_step
 from tests.adaptation.test_stacking import CONFIG, model

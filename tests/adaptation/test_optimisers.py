@@ -6,7 +6,7 @@ from threading import get_ident
 import pytest
 import torch
 
-from hyperplanes.adaptation.optimisers import Muon, make_optimisers, orthogonalise
+from hyperplanes.adaptation.optimisation.optimisers import Muon, make_optimisers, orthogonalise
 
 
 @pytest.mark.parametrize("shape", [(40, 40), (60, 20), (20, 60)])
@@ -44,9 +44,9 @@ def test_tensors_that_are_not_on_a_cpu_are_stepped_in_the_calling_thread(monkeyp
     # Other threads have their own streams on a GPU, which do not wait for the gradients of this thread.
     seen = []
     monkeypatch.setattr(
-        "hyperplanes.adaptation.optimisers.orthogonalise", lambda value: seen.append(get_ident()) or value
+        "hyperplanes.adaptation.optimisation.optimisers.orthogonalise", lambda value: seen.append(get_ident()) or value
     )
-    monkeypatch.setattr("hyperplanes.adaptation.optimisers.parallel_map", in_another_thread)
+    monkeypatch.setattr("hyperplanes.adaptation.optimisation.optimisers.parallel_map", in_another_thread)
     values = [torch.zeros(4, 4, device=device, requires_grad=True) for _ in range(2)]
     for value in values:
         value.grad = torch.zeros_like(value)

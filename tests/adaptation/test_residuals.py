@@ -9,17 +9,18 @@ from threading import Thread
 import pytest
 import torch
 
-from hyperplanes.adaptation import CorrectedField, HyperPlanes, ResidualField, residuals
+from hyperplanes.adaptation import CorrectedField, HyperPlanes, ResidualField
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.correction import residuals
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
-from hyperplanes.adaptation.kept import keep_field, recall_field
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.commands.inputs.disk_cache import keep_field, recall_field
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast
 from hyperplanes.rendering import RayMarching
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
 from tests.adaptation import test_stacking
 from tests.reference_rendering import ball_views, camera_at, ring

@@ -7,15 +7,11 @@ from functools import cache
 import pytest
 import torch
 
-from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig, held_out, stacking
+from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig
 from hyperplanes.adaptation.context import live_pixels
-from hyperplanes.adaptation.descent import Descent, contrast, split_holdout
-from hyperplanes.adaptation.fine_tuned import random_model
-from hyperplanes.adaptation.fine_tuning import fine_tune
-from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.held_out import EVEN, FEWEST, HELD_OUT, PIXELS, hold_out
-from hyperplanes.adaptation.kept import keep_field, recall_field
-from hyperplanes.adaptation.stacking import (
+from hyperplanes.adaptation.correction import held_out, stacking
+from hyperplanes.adaptation.correction.held_out import EVEN, FEWEST, HELD_OUT, PIXELS, hold_out
+from hyperplanes.adaptation.correction.stacking import (
     CAUTION,
     MARGIN,
     StackedField,
@@ -25,7 +21,12 @@ from hyperplanes.adaptation.stacking import (
     learned_part,
     stack,
 )
+from hyperplanes.adaptation.fine_tuned import random_model
+from hyperplanes.adaptation.fine_tuning import fine_tune
+from hyperplanes.adaptation.gating import GatingNetwork
+from hyperplanes.adaptation.optimisation.descent import Descent, contrast, split_holdout
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.commands.inputs.disk_cache import keep_field, recall_field
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.fields import ImageBasedConfig
 from hyperplanes.fields.base import Field
@@ -33,12 +34,12 @@ from hyperplanes.geometry.cameras import centres
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import SUBPIXELS, Sphere, cast
-from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.hypernetwork import VolumeHyperNetworkConfig
 from hyperplanes.rendering import Hierarchical, RayMarching, render
 from hyperplanes.training import TrainingConfig
 from hyperplanes.training.validation import Validator
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from tests.reference_rendering import Balls, awaken, ball_views, ring
 
 NETWORK = ImageBasedConfig(depth=2, width=16, planes=4, blended=2, grid=5, point_frequencies=2, direction_frequencies=1)

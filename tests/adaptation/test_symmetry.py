@@ -9,12 +9,18 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from hyperplanes.adaptation import HullBlend, HyperPlanes, finding_symmetry, judging_symmetry, reflections, symmetry
+from hyperplanes.adaptation import HullBlend, HyperPlanes
+from hyperplanes.adaptation.alignment import finding_symmetry
+from hyperplanes.adaptation.alignment.rotation import Rotation
 from hyperplanes.adaptation.base import hull
 from hyperplanes.adaptation.fine_tuned import FromScratch
 from hyperplanes.adaptation.fine_tuning import made_anyway
-from hyperplanes.adaptation.judging_symmetry import SymmetryJudge, carved
-from hyperplanes.adaptation.reflections import (
+from hyperplanes.adaptation.symmetry import detection as symmetry
+from hyperplanes.adaptation.symmetry import judging as judging_symmetry
+from hyperplanes.adaptation.symmetry import reflections
+from hyperplanes.adaptation.symmetry.detection import AXES, ReflectedHullBlend, possible_symmetries, symmetry_of
+from hyperplanes.adaptation.symmetry.judging import SymmetryJudge, carved
+from hyperplanes.adaptation.symmetry.reflections import (
     HANDICAP,
     ROTATED,
     UNKNOWN,
@@ -23,14 +29,12 @@ from hyperplanes.adaptation.reflections import (
     reflected,
     with_reflections,
 )
-from hyperplanes.adaptation.rotation import Rotation
-from hyperplanes.adaptation.symmetry import AXES, ReflectedHullBlend, possible_symmetries, symmetry_of
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.geometry import Sphere, cast
 from hyperplanes.geometry.cameras import camera_from_world, centres, image_size
 from hyperplanes.geometry.rays import pixel_grid
-from hyperplanes.geometry.reflections import Plane, Symmetry, reflected_cameras
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry, reflected_cameras
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views, join_views
 from tests.adaptation.test_stacking import CONFIG
 from tests.reference_rendering import ball_views, camera_at, ring, small_model
@@ -413,7 +417,7 @@ def test_gradient_steps_draw_rays_of_reflections_only_with_few_views(drawn, give
 
 
 def test_kernels_and_pytorch_choose_the_same_views_with_handicaps(monkeypatch):
-    from hyperplanes.geometry import visibility as module
+    from hyperplanes.geometry.visibility import planes as module
 
     views = ball_views(ring(3, (20, 24)))
     planes = HullBlend().adapt(views).field.planes.with_handicaps(torch.tensor([0.0, 0.3, 0.1]))

@@ -11,7 +11,7 @@ from hyperplanes.capture import Settings, capture, pipeline
 from hyperplanes.capture.masks import network
 from hyperplanes.capture.photographs import find_photographs, list_photographs, read_upright, without_copies
 from hyperplanes.capture.scene import write_scene
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 from tests.fuzz.published import Published
 
 ORIENTATION, MODEL, EXIF, FOCAL_35 = 0x0112, 0x0110, 0x8769, 0xA405

@@ -10,7 +10,7 @@ from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.configuration.compatibility import check_model, check_training
 from hyperplanes.configuration.presets import PRESETS, preset
 from hyperplanes.fields import find_targets
-from hyperplanes.geometry.reflections import Plane, Symmetry
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.hypernetwork import ConvNet, ResNet101
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.training import Trainer

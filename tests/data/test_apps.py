@@ -15,10 +15,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_formats import FOCAL, HEIGHT, VIEWS, WIDTH, are_graded, expected, eyes_and_axes, found, graded_masks, pictures
 
-from hyperplanes.commands.scene import refuse_sources
+from hyperplanes.commands.inputs.scene import refuse_sources
 from hyperplanes.data import DataError, open_dataset, read_task, read_views
-from hyperplanes.data.formats.apps.calibration import brown_lens
 from hyperplanes.data.formats.apps.realitycapture import world_from_angles
+from hyperplanes.data.formats.calibration import brown_lens
 from hyperplanes.data.pictures.undistort import distort
 
 CENTRE = (14.0, 9.0)  # pixel centres at integers; add 0.5 from the corner

@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from hyperplanes.data import DataError, open_dataset, read_task, read_views
-from hyperplanes.data.formats.colmap import read_colmap
+from hyperplanes.data.formats.scenes.colmap import read_colmap
 from hyperplanes.data.pictures.undistort import distort, undistort
 from hyperplanes.geometry import cameras as camera
 

@@ -13,7 +13,7 @@ from PIL import Image
 from hyperplanes.configuration.settings_file import read_experiment
 from hyperplanes.data import DataError, read_views
 from hyperplanes.data.pictures.images import read_image
-from hyperplanes.utilities.files import read_json
+from hyperplanes.utilities.files.reading import read_json
 from tests.fuzz.campaign import time_limit
 from tests.fuzz.corpus import CORPUS
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from hyperplanes.data.formats.sparse_points import read_sparse_points
+from hyperplanes.data.formats.scenes.sparse_points import read_sparse_points
 from hyperplanes.data.inspection.picture import draw_coverage
 from hyperplanes.data.inspection.scene import describe_scene
 from hyperplanes.geometry import Sphere

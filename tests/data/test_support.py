@@ -14,7 +14,7 @@ from hyperplanes.geometry.cameras import centres
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import TrainingConfig, train
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import class_of
 from tests.reference_rendering import Balls, small_model
 

@@ -15,9 +15,9 @@ from PIL import Image
 from hyperplanes.data import DataError, Dataset, open_dataset
 from hyperplanes.data.dataset import open_datasets
 from hyperplanes.data.formats.catalogue import FORMAT
-from hyperplanes.utilities.encoding import encode_npz, encode_png
-from hyperplanes.utilities.files import read_json
-from hyperplanes.utilities.writing import write_folder, write_whole
+from hyperplanes.utilities.files.encoding import encode_npz, encode_png
+from hyperplanes.utilities.files.reading import read_json
+from hyperplanes.utilities.files.writing import write_folder, write_whole
 
 
 @pytest.fixture
@@ -131,6 +131,6 @@ def test_a_huge_json_file_is_refused_without_reading_it(tmp_path):
 
 def test_writing_needs_no_torch():
     """Property: the generator and its workers start without torch, with a third of the time and memory."""
-    modules = "hyperplanes.data.formats.transforms_document, data_gen.datasets.generate"
+    modules = "hyperplanes.data.formats.scenes.transforms_document, data_gen.datasets.generate"
     code = f"import {modules}, sys; print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from hyperplanes.commands.console import Console
-from hyperplanes.commands.scene import read_path, read_scene
+from hyperplanes.commands.inputs.scene import read_path, read_scene
+from hyperplanes.commands.output.console import Console
 from hyperplanes.data import DataError, open_dataset, read_task, read_views
 from hyperplanes.data.formats.recognise import read_posed_task
-from hyperplanes.data.formats.transforms_document import transforms_document
-from hyperplanes.data.formats.transforms_json import _lens, read_transforms
+from hyperplanes.data.formats.scenes.transforms_document import transforms_document
+from hyperplanes.data.formats.scenes.transforms_json import _lens, read_transforms
 from hyperplanes.data.pictures.frames import assemble
 from hyperplanes.data.pictures.undistort import distort
 from hyperplanes.geometry import cameras as camera

@@ -10,7 +10,7 @@ from PIL import Image
 
 from hyperplanes.data import DataError, Dataset, open_dataset, read_channel, read_task, read_views
 from hyperplanes.data.formats.catalogue import FORMAT
-from hyperplanes.data.formats.npz import read_npz
+from hyperplanes.data.formats.collections.npz import read_npz
 
 
 def refused(action, *argument, match):

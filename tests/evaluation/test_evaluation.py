@@ -13,7 +13,7 @@ from hyperplanes.evaluation import ObjectScore, Score, evaluate, evaluate_all
 from hyperplanes.evaluation.figures import PictureGrid
 from hyperplanes.evaluation.suitability import suitability_warnings, worse_than_copying
 from hyperplanes.evaluation.tables import rows
-from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
+from hyperplanes.utilities.images.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 from tests.reference_rendering import Balls, awaken, ball_views, ring, small_model
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from hyperplanes.evaluation.perceptual import LPIPS
-from hyperplanes.utilities.checkpoints import CheckpointError, save_tensors
+from hyperplanes.utilities.files.checkpoints import CheckpointError, save_tensors
 
 
 def alexnet():

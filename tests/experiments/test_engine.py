@@ -68,7 +68,7 @@ def reproduced(out, given):
 
 def leave_figures_out(patch):
     """Do not draw figures; `reproduced` draws the figure of each experiment once."""
-    patch.setattr("hyperplanes.utilities.plots.encode_figure", lambda figure, kind: b"")
+    patch.setattr("hyperplanes.utilities.images.plots.encode_figure", lambda figure, kind: b"")
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from hyperplanes.evaluation import ObjectScore, Score, merge_seeds
 from hyperplanes.experiments import EXPERIMENTS, SCALES, report
 from hyperplanes.experiments.configurations import change, configuration, differences
 from hyperplanes.experiments.engine import Outcome
-from hyperplanes.experiments.published import CROSS, SHAPENET, SINGLE, TARGET, TIME
+from hyperplanes.experiments.paper.published import CROSS, SHAPENET, SINGLE, TARGET, TIME
 from hyperplanes.methods import METHODS
 
 

@@ -26,8 +26,8 @@ from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render
 from hyperplanes.experiments.page.charts import line_chart
 from hyperplanes.experiments.page.pictures import ERROR_SCALE, colour_scale, error_map
 from hyperplanes.export.images import orbit_cameras, to_pixels
-from hyperplanes.utilities.checkpoints import CheckpointError
-from hyperplanes.utilities.environment import find_commit
+from hyperplanes.utilities.files.checkpoints import CheckpointError
+from hyperplanes.utilities.machine.environment import find_commit
 from tests.reference_rendering import Balls
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}

@@ -16,7 +16,7 @@ from hyperplanes.experiments.demonstration.settings import DemoSettings
 from hyperplanes.experiments.engine import Runner
 from hyperplanes.experiments.record import Record
 from hyperplanes.experiments.workspace import Workspace
-from hyperplanes.utilities.checkpoints import CheckpointError
+from hyperplanes.utilities.files.checkpoints import CheckpointError
 from tests.reference_rendering import Balls
 
 

@@ -20,8 +20,8 @@ from hyperplanes.geometry.rays import Rays, cast
 from hyperplanes.rendering.renderer import RayMarching, render
 from hyperplanes.rendering.transmittance import transmittance
 from hyperplanes.rendering.voxels import STOP, VoxelGrid, distance_to_filled, render_voxels, shade_voxels
-from hyperplanes.utilities.checkpoints import CheckpointError
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.files.checkpoints import CheckpointError
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
 
 CAMERAS = camera.pinhole(camera.symmetric_intrinsics(48, 48, 0.7), camera.fibonacci_sphere(6, 3.0), 48, 48)
@@ -176,7 +176,7 @@ def test_a_saved_field_does_not_depend_on_the_unit_of_the_world(baked, tmp_path,
 
 
 def test_a_file_that_is_not_a_baked_field_is_refused(tmp_path):
-    from hyperplanes.utilities.checkpoints import save_tensors
+    from hyperplanes.utilities.files.checkpoints import save_tensors
 
     save_tensors(tmp_path / "other.safetensors", {"weights": torch.zeros(3)})
     with pytest.raises(CheckpointError, match=r"other\.safetensors: expected a baked field"):

@@ -13,9 +13,9 @@ from PIL import Image
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export import images
 from hyperplanes.export.images import encode_animation, orbit_cameras, save_images, save_turntable, to_pixels, upward
-from hyperplanes.export.mesh import Surface, density_grid, extract_mesh, save_mesh
-from hyperplanes.export.mesh_filling import fill_hidden
-from hyperplanes.export.mesh_level import Agreement, agreement, choose_level
+from hyperplanes.export.surfaces.mesh import Surface, density_grid, extract_mesh, save_mesh
+from hyperplanes.export.surfaces.mesh_filling import fill_hidden
+from hyperplanes.export.surfaces.mesh_level import Agreement, agreement, choose_level
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera, distorted
 from hyperplanes.geometry.occupancy import full

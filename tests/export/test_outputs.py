@@ -10,7 +10,7 @@ from PIL import Image
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.outputs import output_frames, save_outputs
-from hyperplanes.export.points import point_cloud, save_points
+from hyperplanes.export.surfaces.points import point_cloud, save_points
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere

@@ -17,7 +17,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.rays import Sphere, pixel_grid
 from hyperplanes.rendering.splats import render_splats, rotations_of
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
 
 SIZE = 40

@@ -12,14 +12,14 @@ import trimesh
 from torch.nn.functional import grid_sample
 
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.export import texture
-from hyperplanes.export.mesh import extract_mesh
-from hyperplanes.export.texture import save_textured, texture_surface
+from hyperplanes.export.surfaces import texture
+from hyperplanes.export.surfaces.mesh import extract_mesh
+from hyperplanes.export.surfaces.texture import save_textured, texture_surface
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering.renderer import RayMarching
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
 
 SIZE = 48

@@ -9,10 +9,10 @@ from hyperplanes.fields import ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.geometry import carve
 from hyperplanes.geometry.cameras import camera_from_world
 from hyperplanes.geometry.occupancy import Occupancy
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.parameters import Parameters
 from hyperplanes.rendering import RayMarching, render
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views, join_views
 from tests.reference_rendering import ball_views, camera_at, ring
 

@@ -10,8 +10,8 @@ import torch
 from torch.autograd import forward_ad
 
 from hyperplanes.adaptation import AdaptedField
-from hyperplanes.adaptation.stacking import stack
-from hyperplanes.export import mesh_level
+from hyperplanes.adaptation.correction.stacking import stack
+from hyperplanes.export.surfaces import mesh_level
 from hyperplanes.export.voxel_fitting import render_guide
 from hyperplanes.fields import TARGETS, TargetConfig
 from hyperplanes.fields import layers as packed_layers
@@ -27,15 +27,15 @@ from hyperplanes.views import Views
 from tests.fields.tile_registers import emulated_kernel
 from tests.reference_rendering import ring
 
-HAS_AMX = compiling.layers_module() == "layers_amx"
-HAS_BFLOAT16 = HAS_AMX or compiling.layers_module(mixed_precision=True) == "layers_bfloat16"
-ERRORS = {"layers": 1e-5, "layers_bfloat16": 5e-2, "layers_amx": 1e-4, "layers_amx_bfloat16": 5e-2}
+HAS_AMX = compiling.layers_module() == "layers.amx"
+HAS_BFLOAT16 = HAS_AMX or compiling.layers_module(mixed_precision=True) == "layers.bfloat16"
+ERRORS = {"layers.single": 1e-5, "layers.bfloat16": 5e-2, "layers.amx": 1e-4, "layers.amx_bfloat16": 5e-2}
 """Kernels and their tolerances relative to float64; factors of bfloat16 kernels have 8 bits, or 16 as two numbers."""
 of_bfloat16 = pytest.mark.skipif(not HAS_BFLOAT16, reason="needs AMX, or AVX512_BF16 of AMD")
 
 
 @pytest.fixture(
-    params=[name if name == "layers" else pytest.param(name, marks=of_bfloat16) for name in ERRORS], autouse=True
+    params=[name if name == "layers.single" else pytest.param(name, marks=of_bfloat16) for name in ERRORS], autouse=True
 )
 def module(request, monkeypatch):
     """Each kernel. That for AVX-512 runs on all processors, but is only used by default where it is fast.
@@ -105,7 +105,7 @@ def test_values_do_not_depend_on_batches_and_threads_by_a_bit(module, threads, m
 
 
 @of_bfloat16
-@pytest.mark.parametrize("name", ["layers_bfloat16", "layers_amx_bfloat16"])
+@pytest.mark.parametrize("name", ["layers.bfloat16", "layers.amx_bfloat16"])
 @pytest.mark.parametrize(("depth", "inputs"), [(1, 64), (1, 7), (4, 33)])
 def test_mixed_precision_rounds_only_the_factors_of_products(name, depth, inputs, monkeypatch):
     """Sums and biases have single precision. Later layers may round values near a tie differently."""
@@ -123,7 +123,7 @@ def test_mixed_precision_rounds_only_the_factors_of_products(name, depth, inputs
 @of_bfloat16
 @pytest.mark.parametrize("width", [32, 96, 160])
 def test_amx_supports_widths_that_are_not_multiples_of_64(width, monkeypatch):
-    use("layers_amx", monkeypatch)
+    use("layers.amx", monkeypatch)
     layers, given = layers_of(3, width, 35, 1), torch.randn(50, 35, generator=torch.Generator().manual_seed(1))
     expected = by_pytorch([(weight.double(), bias.double()) for weight, bias in layers], given.double(), 1)
     torch.testing.assert_close(PackedLayers.of(layers, 1)(given), expected.float(), rtol=1e-4, atol=1e-4)
@@ -175,13 +175,29 @@ def test_inconsistent_shapes_are_left_to_pytorch():
     [
         (None, True, True, True, (22, 1, 0), {}, [None, None]),
         (1, False, False, False, (22, 1, 0), {}, [None, None]),
-        (1, True, False, False, (22, 1, 0), {}, ["layers", "layers"]),
-        (1, True, False, True, (22, 1, 0), {}, ["layers", "layers_bfloat16"]),
-        (1, True, True, True, (22, 1, 0), {}, ["layers_amx", "layers_amx_bfloat16"]),
-        (1, True, True, True, (15, 0, 7), {}, ["layers", "layers"]),  # would crash at the first AMX instruction
-        (1, True, True, True, (22, 1, 0), {"CPU_NAME": "generic"}, ["layers", "layers"]),  # cannot compile AMX
-        (1, True, True, True, (22, 1, 0), {"CPU_FEATURES": "+avx2"}, ["layers", "layers"]),
-        (1, True, False, True, (22, 1, 0), {"ENABLE_AVX": 0}, ["layers", "layers"]),
+        (1, True, False, False, (22, 1, 0), {}, ["layers.single", "layers.single"]),
+        (1, True, False, True, (22, 1, 0), {}, ["layers.single", "layers.bfloat16"]),
+        (1, True, True, True, (22, 1, 0), {}, ["layers.amx", "layers.amx_bfloat16"]),
+        (
+            1,
+            True,
+            True,
+            True,
+            (15, 0, 7),
+            {},
+            ["layers.single", "layers.single"],
+        ),  # would crash at the first AMX instruction
+        (
+            1,
+            True,
+            True,
+            True,
+            (22, 1, 0),
+            {"CPU_NAME": "generic"},
+            ["layers.single", "layers.single"],
+        ),  # cannot compile AMX
+        (1, True, True, True, (22, 1, 0), {"CPU_FEATURES": "+avx2"}, ["layers.single", "layers.single"]),
+        (1, True, False, True, (22, 1, 0), {"ENABLE_AVX": 0}, ["layers.single", "layers.single"]),
     ],
 )
 def test_the_kernel_depends_on_the_processor_and_the_compiler(  # noqa: PLR0913
@@ -237,7 +253,7 @@ def test_a_field_has_the_same_values_with_gradients_and_without(module, used):
     field, directions = field_of(CONFIG), torch.nn.functional.normalize(POINTS, dim=1)
     learned = field(POINTS, directions)
     learned[0].sum().backward()
-    assert all(value.grad is not None for name, value in field.parameters.items() if name.startswith("layers"))
+    assert all(value.grad is not None for name, value in field.parameters.items() if name.startswith("layers.single"))
     assert not used
     with torch.no_grad():
         found = field(POINTS, directions)

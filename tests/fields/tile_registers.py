@@ -1,4 +1,4 @@
-"""An emulation of the AMX instructions that `layers_amx` uses, with tile registers in memory, for other processors.
+"""An emulation of the AMX instructions that `layers.amx` uses, with tile registers in memory, for other processors.
 
 Source of truth: the "Tile" and "AMX" instructions of Intel's manual (Software Developer's Manual, volume 2).
 """
@@ -15,7 +15,8 @@ from llvmlite import binding, ir
 from numba import carray, cfunc, njit, types
 from numba.core import cgutils, config
 
-from hyperplanes.geometry.kernels import compiling, layers_amx
+from hyperplanes.geometry.kernels import compiling
+from hyperplanes.geometry.kernels.layers import amx as layers_amx
 
 __all__ = ["emulated_kernel"]
 
@@ -87,7 +88,7 @@ def emulated_kernel(name):
     """An emulated `compile_kernel(name, torch.float32)`.
 
     Args:
-        name: "layers_amx.layers" or "layers_amx_bfloat16.layers".
+        name: "layers.amx.layers" or "layers.amx_bfloat16.layers".
     """
     registers = {}
 

@@ -16,15 +16,15 @@ import numpy as np
 import torch
 
 import hyperplanes as hp
-from hyperplanes.adaptation.hull_blend import HullBlend
+from hyperplanes.adaptation.baselines.hull_blend import HullBlend
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.data import read_channel
 from hyperplanes.data.camera_path import read_camera_path
 from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
 from hyperplanes.export.outputs import save_outputs
-from hyperplanes.export.points import point_cloud, save_points
 from hyperplanes.export.splats import fit_splats, save_splats, splats_of
+from hyperplanes.export.surfaces.points import point_cloud, save_points
 from hyperplanes.geometry import Sphere, cameras, occupancy, poses, rays
 from hyperplanes.geometry import lookup as lookups
 from hyperplanes.rendering.depth import seen_surface

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 from tests.fuzz.corpus import CORPUS
 from tests.fuzz.mutations import mutate
 

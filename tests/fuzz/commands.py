@@ -22,7 +22,7 @@ from typing import get_args, get_type_hints
 from PIL import Image
 
 from hyperplanes.commands import find_verbs
-from hyperplanes.utilities.encoding import sha256
+from hyperplanes.utilities.files.encoding import sha256
 from tests.fuzz.campaign import Failure
 from tests.fuzz.corpus import baked, colmap, data_set, meshes, pictures, posed_scene, settings, small_model
 

@@ -13,9 +13,9 @@ from data_gen.datasets.manifest import GenerationState, verify
 from data_gen.meshes.mesh import load_mesh, mesh_parts
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.kept import keep_field, recall_field
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages
+from hyperplanes.commands.inputs.disk_cache import keep_field, recall_field
 from hyperplanes.configuration.presets import preset
 from hyperplanes.configuration.settings_file import read_experiment
 from hyperplanes.configuration.training import TrainingConfig
@@ -25,8 +25,8 @@ from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import Sphere, cameras
 from hyperplanes.training.checkpointing import Checkpointing
 from hyperplanes.training.optimisation import Optimisation
-from hyperplanes.utilities.encoding import encode_json, sha256
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.encoding import encode_json, sha256
+from hyperplanes.utilities.files.writing import write_json
 from tests.fuzz.published import Published
 
 VIEWS, HEIGHT, WIDTH = 4, 10, 12

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import load, save
 
-from hyperplanes.utilities.checkpoints import CHECKSUM, _checksum
+from hyperplanes.utilities.files.checkpoints import CHECKSUM, _checksum
 
 NUMBERS = ["-1", "0", "1e309", "-1e-300", "NaN", "9223372036854775808", "4294967296", "1" * 400, "0.5", "2"]
 VALUES = [*NUMBERS, "null", "true", '""', "[]", "{}", '"../../x"', '"\\u0000"', "[[[[1]]]]", '{"a": 1}']

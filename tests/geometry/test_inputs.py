@@ -9,7 +9,7 @@ import torch
 from torch.autograd import forward_ad, gradgradcheck
 
 from hyperplanes.geometry import ImagePlanes, Sphere, cameras, carve, cast, sample
-from hyperplanes.geometry.kernels import operators
+from hyperplanes.geometry.kernels.lookup import operators
 from hyperplanes.geometry.lookup import lookup
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.packed_images import pack

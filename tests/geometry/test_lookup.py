@@ -235,7 +235,7 @@ def test_directions_and_distances_match_centres():
 
 def test_the_operator_passes_opcheck():
     """torch.library.opcheck tests the schema, the fake tensor and the registration of autograd."""
-    from hyperplanes.geometry.kernels import operators
+    from hyperplanes.geometry.kernels.lookup import operators
 
     points, ours, images = scene(points=7)
     matrices = cameras.projection_matrices(ours)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from hyperplanes.geometry import Sphere
-from hyperplanes.geometry.mirror_symmetry import most_symmetric_plane
 from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.symmetry.mirror_symmetry import most_symmetric_plane
 
 PAIRED = [((0.0, 0.1, 0.4), 0.3), ((0.45, 0.0, -0.3), 0.2), ((0.25, 0.45, 0.1), 0.15)]
 """Centres and radii on one side of the plane x = 0; the centre of the first ball lies in the plane."""

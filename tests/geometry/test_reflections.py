@@ -7,7 +7,7 @@ import torch
 
 from hyperplanes.geometry.cameras import camera_from_world, centres, intrinsics, with_poses
 from hyperplanes.geometry.distortion import DistortedCamera, distorted
-from hyperplanes.geometry.reflections import Plane, Symmetry, reflected_cameras
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry, reflected_cameras
 from tests.reference_rendering import ring
 
 SIZE = (20, 24)

@@ -200,7 +200,7 @@ def test_there_may_be_no_points_no_views_or_no_channels(backend):
         found = sample(*leaves, backend=backend)
         assert found.shape == (len(where), len(ours), ours.shape[1])
     assert sample(images, coordinates[:1], backend=backend).shape == (1, 4, 3)
-    from hyperplanes.geometry.kernels import operators
+    from hyperplanes.geometry.kernels.lookup import operators
 
     for value in operators.sample_backward(images, coordinates[:0], None, 0, torch.zeros(0, 4, 3), True, True):
         assert not value.any()
@@ -225,7 +225,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads():
 
 def test_the_operator_passes_opcheck():
     """torch.library.opcheck tests the schema, the fake tensor and the registration of autograd."""
-    from hyperplanes.geometry.kernels import operators
+    from hyperplanes.geometry.kernels.lookup import operators
 
     images, coordinates = scene(points=7)
     tests = ("test_schema", "test_autograd_registration", "test_faketensor")
@@ -240,7 +240,7 @@ def test_the_operator_passes_opcheck():
 
 def test_compiled_code_gives_the_same():
     """Another implementation: eager mode. One graph with gradients, without untraceable checks of shapes."""
-    from hyperplanes.geometry.kernels import operators
+    from hyperplanes.geometry.kernels.lookup import operators
 
     images, coordinates = scene(points=50)
 

@@ -143,7 +143,7 @@ def test_all_functions_that_a_kernel_calls_are_inlined():
 
     Cached machine code then gave other bits than newly compiled machine code.
     """
-    names = [module.name for module in pkgutil.iter_modules(kernels.__path__, PREFIX)]
+    names = [module.name for module in pkgutil.walk_packages(kernels.__path__, PREFIX)]
     modules = [vars(importlib.import_module(name)) for name in names if not name.endswith("_triton")]
     functions = [it for names in modules for it in names.values() if isinstance(it, Dispatcher)]
     assert functions

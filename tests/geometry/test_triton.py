@@ -15,7 +15,7 @@ INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("chosen", [False, True])
 def test_values_and_gradients_are_those_of_plain_torch(dtype, chosen):
-    from hyperplanes.geometry.kernels import lookup_triton
+    from hyperplanes.geometry.kernels.lookup import lookup_triton
 
     device = "cpu" if INTERPRETED else "cuda"
     generator = torch.Generator().manual_seed(0)

@@ -7,18 +7,28 @@ from threading import Thread
 import pytest
 import torch
 
-import hyperplanes.geometry.first_hits as first_hits_module
-from hyperplanes.adaptation.hull_blend import blend_views
+import hyperplanes.geometry.visibility.first_hits as first_hits_module
+from hyperplanes.adaptation.baselines.hull_blend import blend_views
 from hyperplanes.geometry import Sphere, carve, cast
-from hyperplanes.geometry import visibility as module
-from hyperplanes.geometry.against import fading, margins
 from hyperplanes.geometry.cameras import centres, concatenate, projection_matrices
-from hyperplanes.geometry.chosen_views import ANGLE, BEYOND, CUT, DEEPEST, MARGIN, PARTLY, UNSEEN, WHOLE, Penalties
+from hyperplanes.geometry.chosen_views import (
+    ANGLE,
+    BEYOND,
+    CUT,
+    DEEPEST,
+    MARGIN,
+    PARTLY,
+    UNSEEN,
+    WHOLE,
+    Penalties,
+)
 from hyperplanes.geometry.distortion import distorted, distorted_pixels
-from hyperplanes.geometry.first_hits import first_hits
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import pixel_grid
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility import planes as module
+from hyperplanes.geometry.visibility.first_hits import first_hits
+from hyperplanes.geometry.visibility.penalties import fading, margins
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from tests.reference_rendering import ball_views, camera_at, ring
 
 SIZE = (20, 24)

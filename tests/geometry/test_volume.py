@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from hyperplanes.geometry import Sphere, carve
-from hyperplanes.geometry.visibility import VisibilityPlanes
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
 from tests.reference_rendering import ball_views, ring
 

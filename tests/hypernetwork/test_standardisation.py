@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from hyperplanes.hypernetwork.standardisation import EPSILON, RunningStandardisation
+from hyperplanes.hypernetwork.images.standardisation import EPSILON, RunningStandardisation
 
 
 def test_the_statistics_converge_to_those_of_the_inputs():

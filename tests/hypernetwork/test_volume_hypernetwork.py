@@ -6,7 +6,7 @@ from torch.nn.functional import conv3d
 
 from hyperplanes.geometry.volume import CHANNELS, SIDE
 from hyperplanes.hypernetwork import Observed, VolumeHyperNetwork
-from hyperplanes.hypernetwork.volume_network import VolumeNetwork, _Convolution, _fold, _Pointwise, _unfold
+from hyperplanes.hypernetwork.volume.volume_network import VolumeNetwork, _Convolution, _fold, _Pointwise, _unfold
 
 GRIDS = {"coarse.grid.weight": torch.Size((2, SIDE, SIDE, SIDE)), "fine.grid.weight": torch.Size((5, SIDE, SIDE, SIDE))}
 SHAPES = {**GRIDS, "fine.layers.0.weight": torch.Size((12, 7)), "fine.layers.0.bias": torch.Size((12,))}

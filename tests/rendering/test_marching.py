@@ -9,7 +9,7 @@ import torch
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.rendering import RayMarching, march
-from hyperplanes.rendering.marching import _walk_compiled, _walk_torch
+from hyperplanes.rendering.sampling.marching import _walk_compiled, _walk_torch
 from tests.reference_rendering import camera_at, march_ray, some_rays, voxel_is_occupied
 
 OFF_CENTRE = Sphere((0.3, -0.2, 0.1), 0.8)

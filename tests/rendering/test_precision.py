@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch.nn.functional import linear
 
+from hyperplanes.adaptation.alignment.rotation import Rotation
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.fields import base
 from hyperplanes.geometry import occupancy
 from hyperplanes.geometry.cameras import (
@@ -25,11 +25,11 @@ from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.occupancy import carve, full
 from hyperplanes.geometry.poses import farthest_first, outermost_first
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.geometry.reflections import rotation_about
+from hyperplanes.geometry.symmetry.reflections import rotation_about
 from hyperplanes.rendering import footprint as footprints
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.rendering.renderer import allow_tf32
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
 from tests.reference_rendering import awaken, ball_views, ring, small_model
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.utilities.checkpoints import load_tensors
+from hyperplanes.utilities.files.checkpoints import load_tensors
 from tests.reference_rendering import Balls, awaken, small_model
 
 CONFIG = TrainingConfig(steps=5, tasks=1, rays=8, evaluate_every=100, checkpoint_every=1, held_out=0)

@@ -11,10 +11,10 @@ from torch import distributed
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.commands.train import Arguments, resolve
 from hyperplanes.training import start_training
-from hyperplanes.training.distributed import Processes, check_shares
-from hyperplanes.training.launching import _leave, count_processes
-from hyperplanes.utilities.checkpoints import load_tensors, read_json
-from hyperplanes.utilities.processes import is_first_process
+from hyperplanes.training.parallel.distributed import Processes, check_shares
+from hyperplanes.training.parallel.launching import _leave, count_processes
+from hyperplanes.utilities.files.checkpoints import load_tensors, read_json
+from hyperplanes.utilities.machine.processes import is_first_process
 from tests.training.two_processes import KINDS, OPTIONS, Data, normalised, weights_of
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import InitialisationConfig
-from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.fine_tuned import shuffled
+from hyperplanes.adaptation.optimisation.descent import ray_loss
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.parameters import Parameters
 from hyperplanes.training.meta_gradients import maml_gradient, reptile_gradient

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import FineTuned, HyperPlanes, InitialisationConfig
-from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.fine_tuned import shuffled
+from hyperplanes.adaptation.optimisation.descent import ray_loss
 from hyperplanes.data.support import SingleView, WithSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.hypernetwork import AutoencoderConfig

@@ -9,7 +9,7 @@ from hyperplanes.adaptation import HyperPlanes, ModelConfig
 from hyperplanes.fields import find_targets
 from hyperplanes.rendering import RayMarching
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
 from tests.reference_rendering import Balls, small_model
 
 CONFIG = TrainingConfig(steps=120, tasks=1, rays=96, learning_rate=6e-3, final_rate_factor=0.1, held_out=0)

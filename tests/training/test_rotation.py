@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.adaptation.rotation import Rotation
+from hyperplanes.adaptation.alignment.rotation import Rotation
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.training import Trainer

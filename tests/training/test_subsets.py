@@ -12,9 +12,9 @@ from hyperplanes.geometry.cameras import centres
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.rendering import RayMarching
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.training.distributed import Processes
 from hyperplanes.training.episodes.drawing import draw_episodes, episode_object
 from hyperplanes.training.episodes.episode import QUERIES, prepare_subset
+from hyperplanes.training.parallel.distributed import Processes
 from hyperplanes.views import Task, Views
 from tests.reference_rendering import Balls, ball_views, ring, small_model
 

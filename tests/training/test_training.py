@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 
 from hyperplanes.adaptation import Diagnostics, HyperPlanes, base, diagnose
-from hyperplanes.commands.console import Console
+from hyperplanes.commands.output.console import Console
 from hyperplanes.commands.train import follow
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry import cameras, occupancy
@@ -27,11 +27,11 @@ from hyperplanes.training import Trainer, TrainingConfig, checkpointing, objecti
 from hyperplanes.training.forward import forward
 from hyperplanes.training.losses import losses_of
 from hyperplanes.training.monitoring import TensorBoard
-from hyperplanes.utilities import checkpoints, writing
-from hyperplanes.utilities.checkpoints import CheckpointError, read_json
-from hyperplanes.utilities.interrupts import HungUp, Terminated
-from hyperplanes.utilities.metrics import psnr
-from hyperplanes.utilities.settings import SettingsError, structure
+from hyperplanes.utilities.files import checkpoints, writing
+from hyperplanes.utilities.files.checkpoints import CheckpointError, read_json
+from hyperplanes.utilities.files.settings import SettingsError, structure
+from hyperplanes.utilities.images.metrics import psnr
+from hyperplanes.utilities.machine.interrupts import HungUp, Terminated
 from tests.reference_rendering import Balls, awaken, small_model
 from tests.training.test_volume_loss import MODEL
 

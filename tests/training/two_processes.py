@@ -16,13 +16,13 @@ import hyperplanes.data.dataset
 import hyperplanes.training
 from hyperplanes import cli
 from hyperplanes.adaptation import InitialisationConfig
-from hyperplanes.commands.console import Console
+from hyperplanes.commands.output.console import Console
 from hyperplanes.commands.train import follow
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
 from hyperplanes.training.initialisation import initialisation_trainer
-from hyperplanes.utilities.checkpoints import save_tensors
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.checkpoints import save_tensors
+from hyperplanes.utilities.files.writing import write_json
 from tests.reference_rendering import Balls, awaken, small_model
 
 CONFIG = TrainingConfig(

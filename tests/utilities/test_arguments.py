@@ -12,8 +12,8 @@ from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.export.images import orbit_cameras, save_images
 from hyperplanes.geometry import ImagePlanes, cameras
 from hyperplanes.rendering.renderer import RayMarching, render
-from hyperplanes.utilities.arguments import checked
-from hyperplanes.utilities.metrics import psnr
+from hyperplanes.utilities.images.metrics import psnr
+from hyperplanes.utilities.messages.arguments import checked
 from hyperplanes.views import Views
 from tests.reference_rendering import ring
 

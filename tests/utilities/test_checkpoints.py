@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from hyperplanes.utilities.checkpoints import (
+from hyperplanes.utilities.files.checkpoints import (
     CheckpointError,
     load_tensors,
     read_json,
     save_tensors,
 )
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.writing import write_json, write_whole
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.files.writing import write_json, write_whole
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "count": torch.tensor(7), "b": torch.ones(3, 2).T}
 

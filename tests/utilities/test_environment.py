@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from hyperplanes.utilities import environment
-from hyperplanes.utilities.environment import RESULTS, find_commit, has_amx, has_fast_bfloat16
+from hyperplanes.utilities.machine import environment
+from hyperplanes.utilities.machine.environment import RESULTS, find_commit, has_amx, has_fast_bfloat16
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -13,11 +13,11 @@ import pytest
 from data_gen.datasets.generate import Procedural, generate
 from hyperplanes.cli import main
 from hyperplanes.data import open_dataset
-from hyperplanes.data.formats.npz import read_npz
+from hyperplanes.data.formats.collections.npz import read_npz
 from hyperplanes.data.pictures.images import read_image
-from hyperplanes.utilities.checkpoints import load_tensors
-from hyperplanes.utilities.files import DataError, folder_checksum, inside, malformed, read_bytes, read_json
-from hyperplanes.utilities.writing import one_writer
+from hyperplanes.utilities.files.checkpoints import load_tensors
+from hyperplanes.utilities.files.reading import DataError, folder_checksum, inside, malformed, read_bytes, read_json
+from hyperplanes.utilities.files.writing import one_writer
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -115,9 +115,8 @@ def test_every_verb_that_writes_locks_its_folder_and_refuses_a_file(tmp_path, ca
 
 
 def test_a_lock_ends_with_its_process(tmp_path):
-    code = (
-        f"import os; from hyperplanes.utilities import writing\nwith writing.one_writer({str(tmp_path)!r}): os.abort()"
-    )
+    locked = f"with writing.one_writer({str(tmp_path)!r}): os.abort()"
+    code = f"import os; from hyperplanes.utilities.files import writing\n{locked}"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL)
     assert done.returncode == -signal.SIGABRT
     assert (tmp_path / ".lock").exists()
@@ -130,7 +129,7 @@ def test_an_unreadable_folder_inside_does_not_prevent_writing(tmp_path):
     (tmp_path / "lost+found").mkdir(mode=0o700)
     tmp_path.chmod(0o777)
     code = (
-        "import fcntl, os, sys; from hyperplanes.utilities import writing\nos.chdir(sys.argv[1])\n"
+        "import fcntl, os, sys; from hyperplanes.utilities.files import writing\nos.chdir(sys.argv[1])\n"
         "os.setuid(65534) if os.getuid() == 0 else os.chmod('lost+found', 0)\n"
         "with writing.one_writer('.'): writing.write_whole('a', b'whole')"
     )

@@ -10,7 +10,7 @@ import pytest
 from small_demo import demo_folder, first_object
 
 from hyperplanes.cli import main
-from hyperplanes.utilities.interrupts import Terminated, interruptible, keep_handlers
+from hyperplanes.utilities.machine.interrupts import Terminated, interruptible, keep_handlers
 
 SCENE = ["--checkpoint", "{demo}", "--views", "{scene}", "--out"]
 CALLS = {
@@ -92,7 +92,7 @@ def test_an_ignored_signal_stays_ignored():
 
 
 def test_cleanup_is_not_interrupted_again(monkeypatch):
-    monkeypatch.setattr("hyperplanes.utilities.interrupts.AGAIN_SECONDS", 0.01)
+    monkeypatch.setattr("hyperplanes.utilities.machine.interrupts.AGAIN_SECONDS", 0.01)
     ended = []
 
     def work():

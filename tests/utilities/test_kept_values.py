@@ -8,7 +8,7 @@ import torch
 
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.kept import kept
+from hyperplanes.utilities.tensors.kept import kept
 
 
 def test_a_value_is_computed_again_after_an_in_place_change_or_for_another_tensor():

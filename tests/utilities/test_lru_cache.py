@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from hyperplanes.utilities.lru_cache import LRUCache
+from hyperplanes.utilities.tensors.lru_cache import LRUCache
 
 
 @dataclass

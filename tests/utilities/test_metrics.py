@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from hyperplanes.utilities.metrics import foreground_psnr, pooled_psnr, psnr, ssim
+from hyperplanes.utilities.images.metrics import foreground_psnr, pooled_psnr, psnr, ssim
 
 
 @pytest.fixture(scope="module")

@@ -24,9 +24,9 @@ from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.methods import Method, Request, describe_method, make_method
 from hyperplanes.rendering import Hierarchical, RayMarching
 from hyperplanes.utilities import entry_points
-from hyperplanes.utilities.checkpoints import CheckpointError
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.settings import SettingsError, structure
+from hyperplanes.utilities.files.checkpoints import CheckpointError
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.files.settings import SettingsError, structure
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hyperplanes.adaptation.optimisers import make_optimisers
-from hyperplanes.utilities.uncompiled_optimisers import SGD, Adam
+from hyperplanes.adaptation.optimisation.optimisers import make_optimisers
+from hyperplanes.utilities.tensors.uncompiled_optimisers import SGD, Adam
 
 
 def descend(make, **options) -> tuple[list[Tensor], dict]:

@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 
-from hyperplanes.utilities.threads import DECIDED_BY
+from hyperplanes.utilities.machine.threads import DECIDED_BY
 
 CODE = "import os, {first}; print(os.environ.get('OMP_WAIT_POLICY'), 'torch' in __import__('sys').modules)"
 

@@ -24,7 +24,7 @@ import PIL.Image
 from data_gen.meshes.files import IMAGE_FORMATS, MAX_TEXT_BYTES, MeshError, decode_text
 from data_gen.meshes.materials import LinearMaterial, convert_image, roughness_of_exponent
 from data_gen.meshes.model_folder import ModelFolder, without_comment
-from hyperplanes.utilities.colour import linear_from_srgb
+from hyperplanes.utilities.images.colour import linear_from_srgb
 
 __all__ = ["MAX_LIBRARIES", "MtlMaterial", "find_material", "read_materials"]
 

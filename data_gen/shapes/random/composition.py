@@ -11,7 +11,7 @@ from data_gen.shapes.choices import one_of, pick
 from data_gen.shapes.parts import Part
 from data_gen.shapes.primitives import box, cylinder
 from data_gen.shapes.random.cuts import difference
-from data_gen.shapes.random.painting import Paint
+from data_gen.shapes.random.painting.surfaces import Paint
 from data_gen.shapes.random.primitives import primitive
 from data_gen.shapes.random.structures import structure
 from data_gen.shapes.solids import Solid, merged, rotation

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from hyperplanes.data.pictures.images import opacity_of, read_image
-from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.encoding import encode_png
+from hyperplanes.utilities.files.reading import DataError
 
 __all__ = ["Command"]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from hyperplanes.data.formats.transforms_json import read_transforms_task
+from hyperplanes.data.formats.scenes.transforms_json import read_transforms_task
 from hyperplanes.data.pictures.posed import PosedTask
-from hyperplanes.utilities.files import LONGEST_NAME, DataError
+from hyperplanes.utilities.files.reading import LONGEST_NAME, DataError
 
 __all__ = ["FORMAT", "SPLITS", "Catalogue", "is_plain", "native"]
 

@@ -6,15 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hyperplanes.data.formats import co3d, colmap, idr, llff, nmr, npz, nsvf, objaverse, srn
 from hyperplanes.data.formats.apps import metashape, polycam, realitycapture, record3d
 from hyperplanes.data.formats.catalogue import FORMAT, Catalogue, native
-from hyperplanes.data.formats.transforms_json import find_transforms, read_transforms, read_transforms_task
+from hyperplanes.data.formats.collections import co3d, nmr, npz, objaverse, srn
+from hyperplanes.data.formats.scenes import colmap, idr, llff, nsvf
+from hyperplanes.data.formats.scenes.transforms_json import find_transforms, read_transforms, read_transforms_task
 from hyperplanes.data.formats.unposed import refuse_unposed
 from hyperplanes.data.pictures.frames import Listing, assemble
 from hyperplanes.data.pictures.posed import Posed, PosedTask
 from hyperplanes.utilities.entry_points import load_entries
-from hyperplanes.utilities.files import DataError, read_json
+from hyperplanes.utilities.files.reading import DataError, read_json
 
 __all__ = [
     "LAYOUTS",

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.utilities.files import DataError, malformed, read_text
+from hyperplanes.utilities.files.reading import DataError, malformed, read_text
 
 __all__ = ["LARGEST_TEXT", "read_numbers", "read_rows"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from hyperplanes.data.pictures.images import HEIF_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.shell import command_line
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.messages.shell import command_line
 
 __all__ = ["find_video", "photographs_folder", "refuse_unposed"]
 

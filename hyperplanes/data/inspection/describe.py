@@ -14,7 +14,7 @@ from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, che
 from hyperplanes.data.inspection.conventions import Conventions, check_conventions
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 from hyperplanes.views import Task, join_views
 
 __all__ = ["Description", "ObjectDescription", "describe"]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from hyperplanes.data.inspection.scene import NEAR, WORST, SceneReport, angles_to
-from hyperplanes.utilities.plots import encode_figure, new_figure
+from hyperplanes.utilities.images.plots import encode_figure, new_figure
 from hyperplanes.views import Views
 
 __all__ = ["draw_coverage"]

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from hyperplanes.data.formats.sparse_points import SparsePoints
+from hyperplanes.data.formats.scenes.sparse_points import SparsePoints
 from hyperplanes.data.inspection.silhouettes import CoarseHull, masks_tell, small_masks
 from hyperplanes.data.pictures.bounds import cut_off, inverted
 from hyperplanes.data.upright import guess_up, upright

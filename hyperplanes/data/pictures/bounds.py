@@ -15,7 +15,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 
 __all__ = [
     "OFTEN_CUT",
@@ -95,7 +95,7 @@ def cut_off(
     """Which masks reach the border of their image.
 
     A single pixel that is hardly opaque suffices, because a view that counts as showing the object whole limits the
-    sphere. `geometry.visibility.margins`, which is for the blending weights of colours, tolerates a few pixels.
+    sphere. `geometry.visibility.planes.margins`, which is for the blending weights of colours, tolerates a few pixels.
     """
     opaque = masks[:, 0] > 0
     sides = [opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]]

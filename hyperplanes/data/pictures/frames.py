@@ -26,9 +26,9 @@ from hyperplanes.data.pictures.images import (
 from hyperplanes.data.pictures.posed import Posed, posed
 from hyperplanes.data.pictures.undistort import check_lens, undistort
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.errors import listed
-from hyperplanes.utilities.files import DataError
-from hyperplanes.utilities.formatting import counted
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.messages.errors import listed
+from hyperplanes.utilities.messages.formatting import counted
 
 __all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "centred_matrix", "scaled_matrix"]
 

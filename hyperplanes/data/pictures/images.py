@@ -14,7 +14,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import TiffImageFile
 from torch import Tensor
 
-from hyperplanes.utilities.files import DataError, check_regular
+from hyperplanes.utilities.files.reading import DataError, check_regular
 
 __all__ = [
     "FORMATS",

@@ -8,7 +8,7 @@ from itertools import takewhile
 from pathlib import Path
 
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
-from hyperplanes.utilities.files import DataError, check_link
+from hyperplanes.utilities.files.reading import DataError, check_link
 
 __all__ = ["find_masks", "match_masks"]
 

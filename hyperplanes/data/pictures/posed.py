@@ -18,8 +18,8 @@ from hyperplanes.data.pictures.bounds import estimate_bounds, inverted
 from hyperplanes.data.pictures.images import check_downscale, composite_over_white, reduced
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.errors import listed
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.messages.errors import listed
 from hyperplanes.views import Task, Views
 
 __all__ = ["Posed", "PosedTask", "check_pose", "posed"]

@@ -10,7 +10,7 @@ import torch
 from torch.nn.functional import grid_sample
 
 from hyperplanes.geometry.distortion import inverse_distortion, turning_radius
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 
 __all__ = ["COEFFICIENTS", "check_lens", "distort", "undistort"]
 

@@ -13,8 +13,8 @@ from kornia.geometry.camera import PinholeCamera
 from PIL import Image
 
 from hyperplanes.adaptation.checkpoints import find_checkpoint, packaged_folder
+from hyperplanes.adaptation.correction.held_out import FEWEST
 from hyperplanes.adaptation.diagnostics import Diagnostics
-from hyperplanes.adaptation.held_out import FEWEST
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.data.dataset import EXAMPLES, read_task
 from hyperplanes.data.support import Shown
@@ -27,17 +27,17 @@ from hyperplanes.experiments.demonstration.settings import (
     describe_row,
 )
 from hyperplanes.experiments.engine import ORBIT, Runner, curve_of
-from hyperplanes.experiments.experiment import Cell
 from hyperplanes.experiments.page import Exhibit, QueryView, Report, Row, render_page
 from hyperplanes.experiments.page.content import Pixels
+from hyperplanes.experiments.paper.experiment import Cell
 from hyperplanes.export.images import encode_animation, orbit_cameras, picture_paths, to_pixels
 from hyperplanes.geometry.cameras import resized
-from hyperplanes.utilities.checkpoints import read_json
-from hyperplanes.utilities.encoding import encode_png
-from hyperplanes.utilities.environment import environment
-from hyperplanes.utilities.formatting import format_duration
-from hyperplanes.utilities.shell import command_line
-from hyperplanes.utilities.writing import write_json, write_whole
+from hyperplanes.utilities.files.checkpoints import read_json
+from hyperplanes.utilities.files.encoding import encode_png
+from hyperplanes.utilities.files.writing import write_json, write_whole
+from hyperplanes.utilities.machine.environment import environment
+from hyperplanes.utilities.messages.formatting import format_duration
+from hyperplanes.utilities.messages.shell import command_line
 from hyperplanes.views import Task, Views
 
 __all__ = ["compile_kernels", "describe_count", "overview", "write_first_page", "write_report"]

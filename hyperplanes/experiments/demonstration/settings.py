@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hyperplanes.experiments.experiment import Cell, Experiment, Trained
-from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.paper.experiment import Cell, Experiment, Trained
+from hyperplanes.experiments.paper.scales import Scale
 from hyperplanes.methods import at_steps, describe_method
 from hyperplanes.rendering.renderer import RayMarching
-from hyperplanes.utilities.files import folder_checksum
-from hyperplanes.utilities.shell import command_line
+from hyperplanes.utilities.files.reading import folder_checksum
+from hyperplanes.utilities.messages.shell import command_line
 
 __all__ = ["MODELS", "PACKAGED", "TUNED", "DemoSettings", "describe_row"]
 

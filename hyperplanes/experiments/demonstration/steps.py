@@ -12,11 +12,11 @@ from hyperplanes.evaluation import Score
 from hyperplanes.experiments.demonstration.report import compile_kernels, describe_count, write_first_page, write_report
 from hyperplanes.experiments.demonstration.settings import MODELS, TUNED, DemoSettings
 from hyperplanes.experiments.engine import OnScore, Runner
-from hyperplanes.experiments.experiment import Cell
-from hyperplanes.experiments.scales import Scale
+from hyperplanes.experiments.paper.experiment import Cell
+from hyperplanes.experiments.paper.scales import Scale
 from hyperplanes.experiments.workspace import Workspace
 from hyperplanes.methods import at_steps
-from hyperplanes.utilities.writing import write_json
+from hyperplanes.utilities.files.writing import write_json
 
 __all__ = ["Demonstration"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from hyperplanes.experiments.page.pictures import inline
-from hyperplanes.utilities.plots import draw_lines, encode_figure, new_figure, set_counts
+from hyperplanes.utilities.images.plots import draw_lines, encode_figure, new_figure, set_counts
 
 __all__ = ["line_chart"]
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hyperplanes.experiments.page.content import Pixels
-from hyperplanes.utilities.encoding import encode_png
+from hyperplanes.utilities.files.encoding import encode_png
 
 __all__ = ["ERROR_SCALE", "colour_scale", "error_map", "gradient", "inline", "inline_png"]
 

@@ -9,15 +9,15 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel, layers_module
 __all__ = ["RENDERING", "rendering_kernels"]
 
 RENDERING = {
-    "described.describe": "",
-    "lookup_forward.forward": "projected",
-    "visibility.choose": "",
-    "carving.carve": "",
-    "hull_hits.hull_hits": "",
-    "hull_centres.centres": "",
-    "marching.march": "",
-    "first_hits.first_hits": "",
-    "footprints.footprints": "",
+    "visibility.describing.describe": "",
+    "lookup.forward.forward": "projected",
+    "visibility.choosing.choose": "",
+    "hull.carving.carve": "",
+    "hull.hull_hits.hull_hits": "",
+    "hull.centres.centres": "",
+    "voxels.marching.march": "",
+    "hull.first_hits.first_hits": "",
+    "hull.footprints.footprints": "",
 }
 """Names of kernels, and what they take as points; kernels of layers depend on the processor."""
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 
-from hyperplanes.utilities.environment import cache_folder, has_amx, has_bfloat16_products
+from hyperplanes.utilities.machine.environment import cache_folder, has_amx, has_bfloat16_products
 
 __all__ = ["FASTMATH", "compile_function", "compile_kernel", "layers_module"]
 
@@ -37,49 +37,51 @@ _POINTS = "T[::1], int64, T[:, :, ::1], none, none"  # points, their pitch, matr
 _COORDINATES = f"none, int64, none, {_STRIDED}"  # none, their pitch, none, coordinates
 _IMAGES = "T[:, :, :, ::1], uint32[::1], int64, int64, int64"  # planes, the same packed, bits, height, width
 _SIGNATURES = {  # by module and function, without those of points; T is the dtype
-    "lookup_forward.forward": f"{_IMAGES}, T, T, T[::1], T[::1], uint8[::1], boolean, int64[:, ::1]",
-    "lookup_backward.backward": f"{_IMAGES}, T, {_STRIDED}, {_STRIDED}, T[::1], float64[:, ::1], int64[:, ::1]",
-    "lookup_backward.image_backward": f"int64, int64, T, {_STRIDED}, int64, int64, T[::1], int64[:, ::1]",
-    "carving.carve": "T[:, :, ::1], T[:, :, ::1], int32[:, :, ::1], T[::1], T, T, T, T, uint8[:, :, ::1], int64, int64",
-    "visibility.choose": (
+    "lookup.forward.forward": f"{_IMAGES}, T, T, T[::1], T[::1], uint8[::1], boolean, int64[:, ::1]",
+    "lookup.backward.backward": f"{_IMAGES}, T, {_STRIDED}, {_STRIDED}, T[::1], float64[:, ::1], int64[:, ::1]",
+    "lookup.backward.image_backward": f"int64, int64, T, {_STRIDED}, int64, int64, T[::1], int64[:, ::1]",
+    "hull.carving.carve": (
+        "T[:, :, ::1], T[:, :, ::1], int32[:, :, ::1], T[::1], T, T, T, T, uint8[:, :, ::1], int64, int64"
+    ),
+    "visibility.choosing.choose": (
         "T[::1], T[::1], T[::1], T[::1], UniTuple(int64, 6), T[::1], int64[::1], T[::1], int64[::1], T[::1], T[::1], "
         "int64, int64"
     ),
-    "described.describe": (
+    "visibility.describing.describe": (
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T[::1], uint32[::1], T[:, :, :, ::1], UniTuple(int64, 9), T[::1], "
         "T[::1], T[:, ::1], T[::1], T[:, ::1], T[:, ::1], T[:, :, ::1], int64, int64"
     ),
-    "marching.march": (
+    "voxels.marching.march": (
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T[::1], uint8[:, :, ::1], int64[::1], T[::1], int64[::1], "
         "int64, int64"
     ),
-    "hull_hits.hull_hits": (
+    "hull.hull_hits.hull_hits": (
         "T[:, ::1], T[:, ::1], T[::1], T[::1], T, T[::1], T[::1], uint8[:, :, ::1], T[::1], T[::1], "
         "UniTuple(int64, 4), T[::1], T[::1], int64, int64"
     ),
-    "hull_centres.centres": ("T[::1], T[::1], UniTuple(int64, 4), T[::1], T, T[::1], uint8[:, :, ::1], int64, int64"),
-    "first_hits.first_hits": (
+    "hull.centres.centres": ("T[::1], T[::1], UniTuple(int64, 4), T[::1], T, T[::1], uint8[:, :, ::1], int64, int64"),
+    "hull.first_hits.first_hits": (
         "T[:, ::1], T[:, :, :, ::1], T[:, :, :], T[::1], T, T[::1], uint8[:, :, ::1], T[:, :, ::1], int64, int64"
     ),
-    "footprints.footprints": "T[:, ::1], T[:, :, ::1], T[:, :, ::1], T, T, boolean[:, :, ::1], int64, int64",
-    "layers.layers": "T[:, :], T[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
-    "layers_bfloat16.layers": "T[:, :], int32[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
-    "layers_amx_bfloat16.layers": "T[:, :], int16[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
-    "layers_amx.layers": "T[:, :], int16[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
+    "hull.footprints.footprints": "T[:, ::1], T[:, :, ::1], T[:, :, ::1], T, T, boolean[:, :, ::1], int64, int64",
+    "layers.single.layers": "T[:, :], T[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
+    "layers.bfloat16.layers": "T[:, :], int32[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
+    "layers.amx_bfloat16.layers": "T[:, :], int16[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
+    "layers.amx.layers": "T[:, :], int16[::1], T[::1], UniTuple(int64, 3), T[:, ::1], int64, int64",
 }
 
 
 @functools.cache
 def layers_module(*, mixed_precision: bool = False) -> str | None:
-    """The module of this folder whose layer kernel is faster than PyTorch on this processor.
+    """The module of this package whose layer kernel is faster than PyTorch on this processor.
 
     Args:
         mixed_precision: whether factors may be rounded to bfloat16.
 
     Returns:
-        "layers_amx" or "layers_amx_bfloat16" for AMX, "layers_bfloat16" for AVX-512's bfloat16 instructions, "layers"
-        for AVX-512 alone; None without these or numba. All but the last need LLVM 20, and an environment that neither
-        sets numba's target processor nor forbids AVX.
+        "layers.amx" or "layers.amx_bfloat16" for AMX, "layers.bfloat16" for AVX-512's bfloat16 instructions,
+        "layers.single" for AVX-512 alone; None without these or numba. All but the last need LLVM 20, and an
+        environment that neither sets numba's target processor nor forbids AVX.
     """
     if not find_spec("numba"):
         return None
@@ -90,25 +92,25 @@ def layers_module(*, mixed_precision: bool = False) -> str | None:
     for_this_processor = not told_otherwise and getattr(config, "ENABLE_AVX", True)
     if for_this_processor and llvm_version_info >= LLVM_OF_BFLOAT16:
         if has_amx():
-            return "layers_amx_bfloat16" if mixed_precision else "layers_amx"
+            return "layers.amx_bfloat16" if mixed_precision else "layers.amx"
         if mixed_precision and has_bfloat16_products():
-            return "layers_bfloat16"
+            return "layers.bfloat16"
     try:
-        return "layers" if get_host_cpu_features().get("avx512f") else None
+        return "layers.single" if get_host_cpu_features().get("avx512f") else None
     except RuntimeError:  # a processor unknown to LLVM
         return None
 
 
 @functools.cache
 def compile_kernel(name: str, dtype: torch.dtype, points: str = "") -> Callable[..., None]:
-    """A kernel of this folder, compiled ahead of its first call.
+    """A kernel of this package, compiled ahead of its first call.
 
     Args:
         name: module and function, one of the keys of `_SIGNATURES`.
         dtype: float32 or float64.
         points: "projected" or "given" for the kernels of lookup and sampling.
     """
-    module, function = name.split(".")
+    module, _, function = name.rpartition(".")
     kernels = importlib.import_module(f"hyperplanes.geometry.kernels.{module}")
     number = str(dtype).removeprefix("torch.")
     signature = {"": "", "projected": f"{_POINTS}, ", "given": f"{_COORDINATES}, "}[points] + _SIGNATURES[name]
@@ -204,7 +206,7 @@ def _cache_folder() -> str:
     """
     from numba.core import config
 
-    sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+    sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py")))
     base = getattr(config, "CACHE_DIR", "") or cache_folder()
     folder = Path(base) / "hyperplanes" / f"kernels-{hashlib.sha256(sources).hexdigest()[:12]}"
     try:

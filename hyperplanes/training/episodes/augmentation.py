@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
+from hyperplanes.adaptation.alignment.rotation import Rotation
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.adaptation.rotation import Rotation
 from hyperplanes.rendering.compositing import Rendered
 
 __all__ = ["draw_rotation", "drop_planes", "over_random_colour", "rotated_volume"]

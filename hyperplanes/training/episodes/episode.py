@@ -13,8 +13,8 @@ from torch import Tensor
 from hyperplanes.adaptation.context import SupportContext, live_pixels
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.compatibility import VOLUME_CHANNELS
-from hyperplanes.geometry.visibility import VisibilityPlanes
-from hyperplanes.utilities.errors import prefix_errors
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
+from hyperplanes.utilities.messages.errors import prefix_errors
 from hyperplanes.views import Task, Views, join_views
 
 __all__ = ["Episode", "prepare_episode", "prepare_subset", "volume_of_all_views"]

@@ -15,7 +15,6 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.training.distributed import Processes
 from hyperplanes.training.episodes.augmentation import draw_rotation, rotated_volume
 from hyperplanes.training.episodes.drawing import (
     draw,
@@ -28,8 +27,9 @@ from hyperplanes.training.episodes.drawing import (
 )
 from hyperplanes.training.episodes.episode import Episode, prepare_episode, prepare_subset, volume_of_all_views
 from hyperplanes.training.episodes.prefetching import Prefetcher
-from hyperplanes.utilities.encoding import sha256
-from hyperplanes.utilities.lru_cache import LRUCache
+from hyperplanes.training.parallel.distributed import Processes
+from hyperplanes.utilities.files.encoding import sha256
+from hyperplanes.utilities.tensors.lru_cache import LRUCache
 from hyperplanes.views import Task, Tasks, class_of
 
 __all__ = ["Batch", "Draw", "EpisodeLoader", "reads_hull", "reference_objects", "training_names"]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Generic, TypeVar
 
-from hyperplanes.utilities.lru_cache import LRUCache
+from hyperplanes.utilities.tensors.lru_cache import LRUCache
 
 __all__ = ["Prefetcher"]
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.optimisation.descent import ray_loss
 from hyperplanes.configuration.training import TrainingConfig
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters

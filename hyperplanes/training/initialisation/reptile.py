@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from hyperplanes.adaptation.descent import ray_loss
 from hyperplanes.adaptation.fine_tuning import make_descent
+from hyperplanes.adaptation.optimisation.descent import ray_loss
 from hyperplanes.data.support import SingleView
 from hyperplanes.training.episodes import Batch
 from hyperplanes.training.initialisation.base import InitialisationObjective, draw_rays, draw_seed

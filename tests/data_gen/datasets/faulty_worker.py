@@ -5,7 +5,7 @@ import signal
 import time
 from pathlib import Path
 
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 
 
 def serve(settings):

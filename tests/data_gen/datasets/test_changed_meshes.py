@@ -12,7 +12,7 @@ from rendered_here import rendered_here
 from data_gen.commands.generate import summary
 from data_gen.datasets.generate import GenerationConfig, MeshFolder, generate
 from hyperplanes.data import DataError
-from hyperplanes.utilities.encoding import sha256
+from hyperplanes.utilities.files.encoding import sha256
 
 CONFIG = GenerationConfig(views=2, resolution=16, workers=1, held_out=1)
 QUAD = "mtllib b.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 1\nv 0 1 1\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl paint\nf 1/1 2/2 3/3 4/1\n"

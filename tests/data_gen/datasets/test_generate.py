@@ -27,7 +27,7 @@ from data_gen.rigs import RIG_PRESETS, fixed, make_rig
 from hyperplanes.data import DataError, Dataset
 from hyperplanes.data.inspection.describe import describe
 from hyperplanes.geometry import cameras as camera
-from hyperplanes.utilities.writing import one_writer
+from hyperplanes.utilities.files.writing import one_writer
 
 SMALL = {"views": 4, "resolution": 16, "workers": 1}
 CARS = Procedural("car", 5, seed=3)

@@ -16,10 +16,10 @@ from data_gen.rigs import fixed
 from hyperplanes.cli import main
 from hyperplanes.data import mesh_path, open_dataset, read_channel, read_task, read_views
 from hyperplanes.data.dataset import open_datasets
-from hyperplanes.data.formats.npz import catalogue
+from hyperplanes.data.formats.collections.npz import catalogue
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 
 VIEWS = 6
 ITEMS = [

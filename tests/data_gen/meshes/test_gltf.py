@@ -19,7 +19,7 @@ from data_gen.rendering.mesh_renderer import MeshRenderer
 from data_gen.rendering.renderers import probe
 from data_gen.rigs import Rig, orbit
 from data_gen.shapes import make
-from hyperplanes.utilities.colour import linear_from_srgb
+from hyperplanes.utilities.images.colour import linear_from_srgb
 
 KHRONOS = Path(__file__).parents[3] / ".." / "shared" / "meshes" / "khronos"
 SHEET = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float32)

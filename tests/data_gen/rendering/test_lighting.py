@@ -6,7 +6,7 @@ import pytest
 from data_gen.rendering.lighting import LIGHTING_PRESETS, Light, Lighting, resolve_lighting
 from data_gen.rendering.shading import SHOULDER, facing, shade
 from data_gen.rigs import random
-from hyperplanes.utilities.colour import linear_from_srgb, srgb_from_linear
+from hyperplanes.utilities.images.colour import linear_from_srgb, srgb_from_linear
 
 
 def _sphere_shades(lighting, albedo, towards=None):

@@ -12,13 +12,13 @@ from data_gen.shapes.parts import Finish, Part, build_scene
 from data_gen.shapes.primitives import box
 from data_gen.shapes.profiles import ellipse, rectangle
 from data_gen.shapes.random.cuts import CUT, difference
-from data_gen.shapes.random.marks import glyph
 from data_gen.shapes.random.outlines import AROUND, outline
-from data_gen.shapes.random.photographs import PHOTOGRAPHS
+from data_gen.shapes.random.painting.marks import glyph
+from data_gen.shapes.random.painting.photographs import PHOTOGRAPHS
+from data_gen.shapes.random.painting.textures import TEXTURES
 from data_gen.shapes.random.primitives import FRAMES, PRIMITIVES, primitive
 from data_gen.shapes.random.relief import displaced, vertex_normals
 from data_gen.shapes.random.structures import STRUCTURES
-from data_gen.shapes.random.textures import TEXTURES
 from data_gen.shapes.random.tubes import frames_along, subdivided, tube
 
 

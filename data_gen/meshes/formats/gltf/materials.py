@@ -18,7 +18,7 @@ from trimesh.visual.gloss import specular_to_pbr
 from data_gen.meshes.files import IMAGE_FORMATS
 from data_gen.meshes.formats.gltf.container import Document, not_negative, read_uri
 from data_gen.meshes.materials import DEFAULT_COLOUR, DrawnMaterial, LinearMaterial, Wrap, convert_image
-from hyperplanes.utilities.colour import linear_from_srgb
+from hyperplanes.utilities.images.colour import linear_from_srgb
 
 __all__ = ["WRAPS", "GltfMaterial", "TextureCoordinates", "read_materials"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from hyperplanes.utilities.files import DataError
+from hyperplanes.utilities.files.reading import DataError
 
 __all__ = ["find_by_head", "only_one"]
 

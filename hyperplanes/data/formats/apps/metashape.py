@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.formats.apps.calibration import brown_lens, calibrated
 from hyperplanes.data.formats.apps.heads import find_by_head, only_one
 from hyperplanes.data.formats.apps.photographs import find_photographs
+from hyperplanes.data.formats.calibration import brown_lens, calibrated
 from hyperplanes.data.pictures.frames import Frame, Listing
 from hyperplanes.data.pictures.posed import check_pose
-from hyperplanes.utilities.errors import listed
-from hyperplanes.utilities.files import DataError, malformed, read_bytes
+from hyperplanes.utilities.files.reading import DataError, malformed, read_bytes
+from hyperplanes.utilities.messages.errors import listed
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

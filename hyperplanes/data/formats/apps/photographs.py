@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from hyperplanes.data.pictures.images import PICTURE_SUFFIXES
 from hyperplanes.data.pictures.masks import find_masks
-from hyperplanes.utilities.files import DataError, inside, list_files
+from hyperplanes.utilities.files.reading import DataError, inside, list_files
 
 __all__ = ["find_photographs"]
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hyperplanes.data.formats.apps.calibration import calibrated
-from hyperplanes.data.formats.transforms_document import opencv_from_opengl
+from hyperplanes.data.formats.calibration import calibrated
+from hyperplanes.data.formats.scenes.transforms_document import opencv_from_opengl
 from hyperplanes.data.pictures.frames import Frame, Listing
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import check_pose
-from hyperplanes.utilities.files import DataError, check_link, list_files, malformed, read_json
+from hyperplanes.utilities.files.reading import DataError, check_link, list_files, malformed, read_json
 
 __all__ = ["is_polycam", "read_polycam"]
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.formats.apps.calibration import brown_lens, calibration_matrix
 from hyperplanes.data.formats.apps.heads import find_by_head, only_one
 from hyperplanes.data.formats.apps.photographs import find_photographs
-from hyperplanes.data.formats.transforms_document import opencv_from_opengl
+from hyperplanes.data.formats.calibration import brown_lens, calibration_matrix
+from hyperplanes.data.formats.scenes.transforms_document import opencv_from_opengl
 from hyperplanes.data.pictures.frames import Frame, Listing
 from hyperplanes.data.pictures.posed import check_pose
-from hyperplanes.utilities.files import DataError, malformed, read_text
+from hyperplanes.utilities.files.reading import DataError, malformed, read_text
 
 __all__ = ["find_tables", "read_realitycapture", "world_from_angles"]
 

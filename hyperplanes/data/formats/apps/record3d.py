@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.formats.apps.calibration import calibrated
-from hyperplanes.data.formats.transforms_document import opencv_from_opengl
+from hyperplanes.data.formats.calibration import calibrated
+from hyperplanes.data.formats.scenes.transforms_document import opencv_from_opengl
 from hyperplanes.data.pictures.frames import Frame, Listing
 from hyperplanes.data.pictures.masks import find_masks
 from hyperplanes.data.pictures.posed import check_pose
-from hyperplanes.utilities.files import DataError, check_link, malformed, read_json
+from hyperplanes.utilities.files.reading import DataError, check_link, malformed, read_json
 
 __all__ = ["is_record3d", "read_record3d"]
 

@@ -1,0 +1,1 @@
+"""The renderers on OpenGL, through pyrender."""

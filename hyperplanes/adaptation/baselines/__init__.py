@@ -1,0 +1,1 @@
+"""Baselines without learned weights: the nearest view, and colours blended on the visual hull."""

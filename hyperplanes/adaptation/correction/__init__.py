@@ -1,0 +1,1 @@
+"""Correction of rendered pictures by the support views: held-out views, averages with the hull, residuals."""

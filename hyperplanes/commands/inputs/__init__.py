@@ -1,0 +1,1 @@
+"""What the verbs read: views, masks, poses, models and cached results."""

@@ -1,0 +1,1 @@
+"""Layouts of data sets with many objects, one module each."""

@@ -1,0 +1,1 @@
+"""Layouts of single scenes, one module each."""

@@ -1,0 +1,1 @@
+"""Surfaces of fields: meshes, textures and point clouds."""

@@ -1,0 +1,1 @@
+"""Kernels of the visual hull: carving, hits of rays, and the pixels that see it."""

@@ -1,0 +1,1 @@
+"""Kernels of fully connected layers, one module for each kind of processor."""

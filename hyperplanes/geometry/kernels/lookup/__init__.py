@@ -1,0 +1,1 @@
+"""Kernels of lookup and sampling, and their PyTorch operators."""

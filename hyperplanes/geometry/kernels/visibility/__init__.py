@@ -1,0 +1,1 @@
+"""Kernels of visibility: the best views of a point, and what they show of it."""

@@ -1,0 +1,1 @@
+"""Kernels of rays through voxel grids: marching, boxes, and sparse grids."""

@@ -1,0 +1,1 @@
+"""Reflections about planes, and the most symmetric plane of a voxel grid."""

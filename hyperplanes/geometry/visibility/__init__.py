@@ -1,0 +1,1 @@
+"""Which views see a point, and where rays meet the visual hull."""

@@ -1,0 +1,1 @@
+"""Hypernetworks that read images one by one, and the autoencoder."""

@@ -1,0 +1,1 @@
+"""The hypernetwork that reads a volume of all views."""

@@ -1,0 +1,1 @@
+"""Training in several processes: launching them, and averaging their gradients."""

@@ -1,0 +1,1 @@
+"""Files: reading, writing, encoding, settings, weights and tables."""

@@ -1,0 +1,1 @@
+"""Images: their range and colour spaces, metrics and plots."""

@@ -1,0 +1,1 @@
+"""The machine: processor, memory, threads, processes, clocks and signals."""

@@ -1,0 +1,1 @@
+"""Text for people: errors, checked arguments, numbers and shell commands."""

@@ -1,0 +1,1 @@
+"""Tensors: precision, transforms, caches, seeds and optimisers."""
