@@ -8,7 +8,7 @@ writes the tables of the documentation. A benchmark of speed refuses to write ro
 import sys
 from importlib import import_module
 
-from benchmarks.load import LIMIT, OF_SPEED, load_at_start
+from benchmarks.parts.load import LIMIT, OF_SPEED, load_at_start
 from hyperplanes.utilities.messages.errors import one_line, wants_traceback
 
 NAMES = (

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.objects import held_out
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.objects import held_out
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import Renderable
 from hyperplanes.data import read_task

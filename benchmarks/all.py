@@ -23,8 +23,8 @@ from pathlib import Path
 import torch
 
 from benchmarks import tables
-from benchmarks.load import OF_SPEED
-from benchmarks.options import positive
+from benchmarks.parts.load import OF_SPEED
+from benchmarks.parts.options import positive
 from hyperplanes.utilities.machine.environment import usable_cores
 
 __all__ = ["COMMANDS", "OF_DATA", "OF_GPU", "OF_SUITES", "main"]

@@ -14,9 +14,9 @@ import argparse
 import statistics
 from pathlib import Path
 
-from benchmarks._timing import timed
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import timed
 from benchmarks.views import add_data_options, suite_folders
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import Pictures

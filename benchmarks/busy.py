@@ -23,9 +23,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks._timing import ratio
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import ratio
 from hyperplanes.utilities.machine.environment import usable_cores
 
 if TYPE_CHECKING:

@@ -33,9 +33,9 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch.nn.functional import interpolate
 
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish, write_rows
-from benchmarks.staged_photographs import Staged, stage, walk_around
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish, write_rows
+from benchmarks.parts.staged_photographs import Staged, stage, walk_around
 from data_gen.meshes.find import find_meshes
 from data_gen.meshes.mesh import load_mesh
 from hyperplanes.adaptation.base import Adapter

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.options import positive
+from benchmarks.parts.options import positive
 from benchmarks.views import add_data_options, suite_folders
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.checkpoints import find_checkpoint

@@ -25,9 +25,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks._timing import ratio
-from benchmarks.generation_loop import RESOLUTION, VIEWS
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.generation_loop import RESOLUTION, VIEWS
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import ratio
 from data_gen import SUPERSAMPLE
 from hyperplanes.utilities.machine.environment import usable_cores
 
@@ -166,7 +166,7 @@ def looped(objects: int, out: Path, renderer: str) -> Run:
 
     def run() -> int:
         out.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "benchmarks.generation_loop", str(objects), str(out)]
+        command = [sys.executable, "-m", "benchmarks.parts.generation_loop", str(objects), str(out)]
         platform = {"PYOPENGL_PLATFORM": renderer.removeprefix("pyrender-")}
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=os.environ | platform)
         told.update(json.loads(done.stdout.splitlines()[-1]))

@@ -27,10 +27,10 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import pad
 
-from benchmarks._timing import add_device_option, interleaved, peak_bytes, timed
-from benchmarks.objects import held_out
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.objects import held_out
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import add_device_option, interleaved, peak_bytes, timed
 from benchmarks.training import Objects
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import AdaptedField

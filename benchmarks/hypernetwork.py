@@ -18,8 +18,8 @@ from typing import Any
 
 import torch
 
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
 from hyperplanes.adaptation.diagnostics import diagnose
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.presets import Preset, preset

@@ -22,8 +22,8 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.configuration.presets import ALL_LAYERS, Preset, preset
 from hyperplanes.data.dataset import Dataset, open_dataset, open_datasets

@@ -21,12 +21,12 @@ from pathlib import Path
 
 import torch
 
-from benchmarks._timing import add_device_option, copy_bandwidth, interleaved, peak_bytes, ratio, table
-from benchmarks.load import load_at_start
-from benchmarks.lookup_plot import plot
-from benchmarks.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
-from benchmarks.options import positive
-from benchmarks.reporting import Row, write_rows
+from benchmarks.parts.load import load_at_start
+from benchmarks.parts.lookup_plot import plot
+from benchmarks.parts.lookup_ways import STANDARD, Scene, needed_bytes, runs, ways
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, write_rows
+from benchmarks.parts.timing import add_device_option, copy_bandwidth, interleaved, peak_bytes, ratio, table
 from hyperplanes.utilities.machine.environment import environment
 
 __all__ = ["main"]

@@ -20,10 +20,10 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from benchmarks._timing import add_device_option, timed, without
-from benchmarks.objects import held_out
-from benchmarks.rendering_growth import growth, plot_growth
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.objects import held_out
+from benchmarks.parts.rendering_growth import growth, plot_growth
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import add_device_option, timed, without
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.export.baking import BakedScene, bake

@@ -22,10 +22,10 @@ from pathlib import Path
 import torch
 from kornia.geometry.camera import PinholeCamera
 
-from benchmarks._timing import interleaved, ratio, timed, without
-from benchmarks.objects import held_out
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.objects import held_out
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import interleaved, ratio, timed, without
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import AdaptedField, Pictures
 from hyperplanes.data import read_task

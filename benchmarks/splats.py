@@ -15,10 +15,10 @@ from pathlib import Path
 
 import torch
 
-from benchmarks._timing import timed
-from benchmarks.objects import held_out
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.objects import held_out
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import timed
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data import read_task
 from hyperplanes.export.baking import BakedScene, bake, default_side

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv3d
 
-from benchmarks._timing import interleaved, ratio, timed
-from benchmarks.objects import held_out
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.objects import held_out
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import interleaved, ratio, timed
 from benchmarks.training import Objects, step_parts
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.presets import preset

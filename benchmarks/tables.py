@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.view_tables import NAMES, Result, views, views_over, views_residuals, views_summary, views_tuned
+from benchmarks.parts.view_tables import NAMES, Result, views, views_over, views_residuals, views_summary, views_tuned
 from hyperplanes.utilities.files.reading import DataError
 from hyperplanes.utilities.files.tables import markdown_table
 from hyperplanes.utilities.files.writing import write_whole

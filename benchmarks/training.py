@@ -16,9 +16,9 @@ from pathlib import Path
 
 import torch
 
-from benchmarks._timing import add_device_option, interleaved, peak_bytes, ratio, timed
-from benchmarks.objects import held_out
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.objects import held_out
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import add_device_option, interleaved, peak_bytes, ratio, timed
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.configuration.presets import Preset, preset
 from hyperplanes.rendering.renderer import Hierarchical, RayMarching

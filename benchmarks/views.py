@@ -33,8 +33,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import pad
 
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
 from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import torch
 
-from benchmarks._timing import interleaved, ratio
-from benchmarks.objects import held_out
-from benchmarks.options import positive
-from benchmarks.reporting import Row, finish
+from benchmarks.parts.objects import held_out
+from benchmarks.parts.options import positive
+from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.timing import interleaved, ratio
 from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry.chosen_views import Visibility
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes, choose_torch

@@ -18,10 +18,11 @@ import torch
 from small_demo import demo_folder
 
 from benchmarks import __main__ as benchmarks_main
-from benchmarks import _timing, gpu, image_based, steps, tables, views
 from benchmarks import all as all_benchmarks
-from benchmarks import load as machine_load
-from benchmarks.load import OF_SPEED
+from benchmarks import gpu, image_based, steps, tables, views
+from benchmarks.parts import load as machine_load
+from benchmarks.parts import timing as _timing
+from benchmarks.parts.load import OF_SPEED
 from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.correction import stacking

@@ -12,7 +12,7 @@ from functools import cache, partial
 import pytest
 import torch
 
-from benchmarks.objects import held_out
+from benchmarks.parts.objects import held_out
 from hyperplanes.adaptation import HullBlend, HyperPlanes, ResidualField, diagnose, swap_gap
 from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.correction.stacking import StackedField

@@ -1,4 +1,4 @@
-"""Source of truth: the poses, lens and masks of simulated photographs (`benchmarks.staged_photographs`)."""
+"""Source of truth: the poses, lens and masks of simulated photographs (`benchmarks.parts.staged_photographs`)."""
 
 import json
 
@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from benchmarks.captures import compare_poses
-from benchmarks.staged_photographs import stage, walk_around
+from benchmarks.parts.staged_photographs import stage, walk_around
 from hyperplanes.capture.masks import consistency
 from hyperplanes.capture.packages import is_installed
 from hyperplanes.capture.scene import straightened

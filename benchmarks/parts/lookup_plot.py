@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.lookup_ways import STANDARD
-from benchmarks.reporting import Row
+from benchmarks.parts.lookup_ways import STANDARD
+from benchmarks.parts.reporting import Row
 from hyperplanes.utilities.images.plots import new_figure, save_figure
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from kornia.geometry.camera import PinholeCamera
 
-from benchmarks._timing import timed
-from benchmarks.objects import held_out
-from benchmarks.reporting import Row
+from benchmarks.parts.objects import held_out
+from benchmarks.parts.reporting import Row
+from benchmarks.parts.timing import timed
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.hyperplanes import HyperPlanes, ModelConfig
 from hyperplanes.geometry import cameras as camera

@@ -1,6 +1,6 @@
 """The plain loop over meshes, which `benchmarks.generation` runs in a separate process.
 
-`python -m benchmarks.generation_loop COUNT OUT` prints one line of JSON. This module does not import PyTorch, because
+`python -m benchmarks.parts.generation_loop COUNT OUT` prints one line of JSON. It does not import PyTorch, because
 the time of the import would count.
 """
 

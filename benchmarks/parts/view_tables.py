@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.reporting import Row
+from benchmarks.parts.reporting import Row
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.utilities.files.tables import markdown_table
 

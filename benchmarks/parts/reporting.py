@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from benchmarks.load import load_at_start
+from benchmarks.parts.load import load_at_start
 from hyperplanes.utilities.files.writing import write_whole
 from hyperplanes.utilities.machine.environment import environment
 

@@ -1,0 +1,1 @@
+"""What several benchmarks share, and larger pieces of single ones."""
