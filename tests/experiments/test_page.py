@@ -186,7 +186,7 @@ def test_the_page_of_a_demonstration():
     page = (demo_folder() / "report.html").read_text(encoding="utf-8")
     parser = checked(page)
     assert any(source.startswith("data:image/webp") for source in parser.sources)
-    for name in ("nearest_view", "point_multiplane", "hyperplanes", "hyperplanes_1"):
+    for name in ("nearest_view", "hull_blend", "hull_blend:chair", "point_multiplane", "hyperplanes", "hyperplanes_1"):
         assert f"<small>{name}</small>" in page
     assert "arXiv 2402.01524" in page
     assert find_commit() in page
@@ -211,7 +211,8 @@ def test_the_first_page_uses_the_packaged_model_even_if_a_folder_has_its_name(tm
         model = HyperPlanes.from_pretrained(packaged_folder("small"))
     assert (tmp_path / "first.html").exists()
     rows = [line.partition(":")[0] for line in shown]
-    assert rows == ["nearest of 3 views, copied", "3 views", "the first page"]
+    baselines = ["the nearest support view, copied (3 views)", "support views blended on the visual hull (3 views)"]
+    assert rows == [*baselines, "3 views", "the first page"]
     frames = sorted((tmp_path / "first/pictures/car/views_3/test0/orbit").iterdir())
     support = Shown(balls, 3, 2).task("test0").support
     found = to_pixels(model.adapt(support).render(orbit_cameras(support, 2)).images)

@@ -20,6 +20,7 @@ from hyperplanes.data.dataset import EXAMPLES, read_task
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import Score
 from hyperplanes.experiments.demonstration.settings import (
+    BASELINES,
     MODELS,
     PACKAGED,
     QUERY_VIEWS,
@@ -32,6 +33,7 @@ from hyperplanes.experiments.page.content import Pixels
 from hyperplanes.experiments.paper.experiment import Cell
 from hyperplanes.export.images import encode_animation, orbit_cameras, picture_paths, to_pixels
 from hyperplanes.geometry.cameras import resized
+from hyperplanes.methods import describe_method
 from hyperplanes.utilities.files.checkpoints import read_json
 from hyperplanes.utilities.files.encoding import encode_png
 from hyperplanes.utilities.files.writing import write_json, write_whole
@@ -124,7 +126,9 @@ def compile_kernels(device: torch.device) -> None:
 
 def describe_count(row: str, most: int) -> str:
     """The description of a row of the first page."""
-    return f"nearest of {most} views, copied" if row == "nearest_view" else f"{row.removeprefix('views_')} views"
+    if row in BASELINES:
+        return f"{describe_method(row)} ({most} views)"
+    return f"{row.removeprefix('views_')} views"
 
 
 def write_report(folder: Path, runner: Runner, settings: DemoSettings) -> None:

@@ -21,6 +21,9 @@ TUNED = ("hyperplanes", "scratch")
 MODELS = ("hyperplanes", "point_multiplane")
 """The models that are trained, each in a folder of its name."""
 
+BASELINES = ("nearest_view", "hull_blend")
+"""Methods without learned weights, in the tables of both pages."""
+
 PACKAGED = "small"
 QUERY_VIEWS = 2  # of each object on the page of the packaged model
 MOST = 12  # objects on that page
@@ -102,13 +105,13 @@ class DemoSettings:
         """The methods that are evaluated on held-out objects of the training class."""
         few, many = self.fine_tuned
         tuned = (f"hyperplanes_{few}", f"hyperplanes_{many}", f"scratch_{many}")
-        return ("nearest_view", "point_multiplane", "hyperplanes_swapped", "hyperplanes", *tuned)
+        return (*BASELINES, "point_multiplane", "hyperplanes_swapped", "hyperplanes", *tuned)
 
     @property
     def rows(self) -> tuple[str, ...]:
         """All rows of the table: `methods`, and METHOD:CLASS for methods that are evaluated on the unseen class."""
         many = self.fine_tuned[1]
-        unseen = ("nearest_view", "hyperplanes", f"hyperplanes_{many}", f"scratch_{many}")
+        unseen = (*BASELINES, "hyperplanes", f"hyperplanes_{many}", f"scratch_{many}")
         return (*self.methods, *(f"{method}:{self.unseen_class}" for method in unseen))
 
     @property
@@ -125,10 +128,11 @@ class DemoSettings:
     @property
     def packaged(self) -> Experiment:
         """The packaged model on objects that it was not trained on: a row per number of views, a column per class."""
-        rows = {"nearest_view": self.first_counts[-1]} | {f"views_{count}": count for count in self.first_counts}
+        rows = dict.fromkeys(BASELINES, self.first_counts[-1])
+        rows |= {f"views_{count}": count for count in self.first_counts}
         cells = []
         for row, count in rows.items():
-            method = row if row == "nearest_view" else "hyperplanes"
+            method = row if row in BASELINES else "hyperplanes"
             for on in (*self.first, *(["meshes"] if self.meshes else [])):
                 trained = Trained(on, packaged=PACKAGED)
                 orbit = self.first_frames if row == f"views_{self.first_counts[-1]}" else 0
