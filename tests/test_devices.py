@@ -77,6 +77,19 @@ def small(device, **changes):
     return model
 
 
+def test_masked_planes_and_hulls_take_points_and_cameras_from_another_device():
+    views = car(CPU).support
+    planes = ImagePlanes(views.images, views.cameras, exact=True).mask_views(torch.tensor([0]))
+    points = torch.rand(9, 3) - 0.5
+    hull = carve(views.masks, views.cameras, views.bounds, 8)
+    expected = planes.lookup(points)
+    with other_device() as device:
+        found, voxels = planes.lookup(points.to(device)), carve(views.masks.to(device), views.cameras, views.bounds, 8)
+        assert torch.equal(found.valid.cpu(), expected.valid)
+        torch.testing.assert_close(found.colours.cpu(), expected.colours, atol=1e-5, rtol=0)
+        assert torch.equal(voxels.occupied.cpu(), hull.occupied)
+
+
 def test_operands_on_two_devices_are_refused():
     with other_device() as device:
         there = torch.ones(2, 3, device=device)

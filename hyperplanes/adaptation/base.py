@@ -115,9 +115,9 @@ class AdaptedField:
 
     @property
     def refined_occupancy(self) -> RefinedOccupancy:
-        """The voxels of `occupancy` in which the field has density; computed on first use.
+        """The voxels of `occupancy` in which the field has density: `refined`, or computed on first use.
 
-        They are computed again if weights of a network, or the voxels, have changed in place.
+        Computed ones are computed again if weights of a network, or the voxels, have changed in place.
         """
         if self.refined is not None:
             return self.refined
@@ -127,10 +127,11 @@ class AdaptedField:
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without evaluating colour if the field can do that."""
-        points = as_points(points).to(self.dtype)
+        points = as_points(points)
+        own = points.to(self.dtype)
         if self.thread_safe and points.device.type == "cpu" and not torch.is_grad_enabled():
-            return torch.cat(list(parallel_map(self._density, points.split(POINTS))))
-        return self._density(points)
+            return torch.cat(list(parallel_map(self._density, own.split(POINTS)))).to(points.dtype)
+        return self._density(own).to(points.dtype)
 
     def _density(self, points: Tensor) -> Tensor:
         if self.densities:
@@ -140,8 +141,9 @@ class AdaptedField:
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
-        """Colour and density of the field."""
-        return self.field(points, directions)
+        """Colour and density of the field, in the precision of the points."""
+        colour, density = self.field(points.to(self.dtype), directions.to(self.dtype))
+        return colour.to(points.dtype), density.to(points.dtype)
 
     @without_autocast
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
@@ -172,7 +174,8 @@ class AdaptedField:
 
         Args:
             cameras: any number, one image size, on any device and in any precision.
-            sampling: a sampler; by default that of the field, with denser samples if it is `RayMarching`.
+            sampling: a sampler; by default that of the field, with denser samples if it is `RayMarching`: as many as
+                the camera needs that shows the scene largest.
             antialias: five rays through each pixel at an edge; by default for `RayMarching`.
             mixed_precision: a float32 network may multiply in bfloat16 (`Field.mixed_precision`); otherwise the field
                 decides.

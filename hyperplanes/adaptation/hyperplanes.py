@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import torch
 
@@ -47,14 +48,18 @@ class HyperPlanes(HyperPlanesNetwork):
     """
 
     def without_reflections(self) -> Self:
-        """This model, which from now on uses no reflections of the views of an object, even if it looks symmetric."""
-        self.config = replace(self.config, symmetric=False, symmetry=None)
-        return self
+        """A model with the same weights that uses no reflections of the views of an object that looks symmetric."""
+        return self._configured(symmetric=False, symmetry=None)
 
     def without_residuals(self) -> Self:
-        """This model, from now on without residual correction of its pictures (`adaptation.correction.residuals`)."""
-        self.config = replace(self.config, residuals=False)
-        return self
+        """A model with the same weights without residual correction of its pictures (`correction.residuals`)."""
+        return self._configured(residuals=False)
+
+    def _configured(self, **changes: Any) -> Self:
+        """A model that shares the weights of this one and has another configuration."""
+        result = copy(self)
+        result.config = replace(self.config, **changes)
+        return result
 
     @checked
     @without_autocast

@@ -43,6 +43,7 @@ class Swapped:
         if len(self._updates) < 2:
             raise ValueError(f"swapped: expected at least 2 objects to swap updates of, got {len(self._updates)}")
 
+    @torch.inference_mode(mode=False)  # learned steps read gradients
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:
         """The field of theta plus the update of the next object, with everything else as for the object itself."""

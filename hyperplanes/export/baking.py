@@ -181,7 +181,8 @@ def _voxels(
     adapted: AdaptedField, points: Tensor, view: Tensor, arriving: Tensor, voxel: float
 ) -> tuple[Bool[Tensor, " point"], Float[Tensor, "filled 28"]]:
     """Which points have density, and the density and coefficients of these."""
-    field, length = adapted.field, adapted.occupancy.bounds.radius / 64
+    field = adapted.field if adapted.dtype == points.dtype else adapted
+    length = adapted.occupancy.bounds.radius / 64
     hidden = field.hidden(points) if isinstance(field, SplitField) else points
     density = field.density_of(hidden) if isinstance(field, SplitField) else adapted.density(points)
     some = 1 - torch.exp(-density * length) > MIN_OPACITY

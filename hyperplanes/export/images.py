@@ -229,7 +229,7 @@ def orbit_cameras(
     positions = camera.centres(cameras).cpu().float() - centre
     up = torch.tensor(upward(cameras))
     front = positions[0] - (positions[0] @ up) * up
-    if float(front.norm()) < 1e-6:
+    if float(front.norm()) < 1e-6 * float(positions[0].norm()):
         front = torch.linalg.cross(up, up.roll(1))
     front = front / front.norm()
     side = torch.linalg.cross(up, front)

@@ -9,6 +9,8 @@ from kornia.geometry.calibration import distort_points
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from hyperplanes.utilities.tensors.kept import kept
+
 __all__ = [
     "DistortedCamera",
     "distorted",
@@ -117,7 +119,7 @@ def distorted_pixels(
     """
     index = torch.arange(cameras.batch_size, device=pixels.device)[None] if views is None else views
     matrix = cameras.intrinsics[:, :3, :3].to(pixels)[index]
-    limit = turning_radius(cameras.distortion).to(pixels)[index]
+    limit = _limits(cameras).to(pixels)[index]
     focal = torch.stack([matrix[..., 0, 0], matrix[..., 1, 1]], -1)
     square = ((pixels - matrix[..., :2, 2]) / focal).square().sum(-1)
     shown = square < limit.square()
@@ -141,10 +143,15 @@ def undistorted_pixels(
     """
     matrix = cameras.intrinsics[view, :3, :3].to(pixels)
     focal, centre = matrix[:, [0, 1], [0, 1]], matrix[:, :2, 2]
-    limit = turning_radius(cameras.distortion).to(pixels)[view]
+    limit = _limits(cameras).to(pixels)[view]
     tolerance = _LARGEST_ERROR / focal.detach().amax(1)
     points, found = inverse_distortion((pixels - centre) / focal, cameras.distortion.to(pixels)[view], limit, tolerance)
     return points * focal + centre, found
+
+
+def _limits(cameras: DistortedCamera) -> Float[Tensor, " view"]:
+    """The turning radius of each camera, computed once."""
+    return kept(cameras, "turning_radius", [cameras.distortion], lambda: turning_radius(cameras.distortion))
 
 
 def inverse_distortion(

@@ -161,7 +161,8 @@ class ImagePlanes:
                 backend=self.backend,
             )
         if self.masked is not None:
-            shown = found.valid & ~(self.masked if views is None else self.masked[views])
+            masked = self.masked.to(points.device)
+            shown = found.valid & ~(masked if views is None else masked[views])
             found = replace(found, colours=torch.where(shown[..., None], found.colours, self.background), valid=shown)
         if not return_directions:
             return found

@@ -203,6 +203,7 @@ def carve(
         raise ValueError(f"votes: expected at least 1, got {votes}")
     if isinstance(cameras, DistortedCamera):
         raise ValueError("cameras: expected pinholes to carve with, got lens distortion; undistort the masks first")
+    cameras = camera.to(cameras, masks.device)
     matrices, calibrations = camera.projection_matrices(cameras).float(), camera.intrinsics(cameras).float()
     fits = masks.device.type == "cpu" and masks[0:1].numel() < 2**30  # pixels in 32 bits
     carver = _carve_compiled if fits and find_spec("numba") and are_plain(masks, matrices) else _carve_torch

@@ -20,7 +20,6 @@ from hyperplanes.geometry.kernels.compiling import compile_function
 __all__ = ["render_splats", "rotations_of"]
 
 DILATION = 0.3  # square pixels
-NEAR = 1e-6  # least depth of Gaussians that are drawn, in world units
 LARGEST_ALPHA, SMALLEST_ALPHA = 0.99, 1 / 255
 DEVIATIONS = 3.0  # extent of a splat from its centre, in standard deviations
 
@@ -61,19 +60,20 @@ def render_splats(
     Returns:
         RGB.
     """
-    pose, matrix = camera.camera_from_world(cameras)[0], camera.intrinsics(cameras)[0]
     height, width = camera.image_size(cameras)
+    cameras = camera.to(cameras, means.device, means.dtype)
+    pose, matrix = camera.camera_from_world(cameras)[0], camera.intrinsics(cameras)[0]
     local = means @ pose[:3, :3].T + pose[:3, 3]
     with torch.no_grad():
         order = torch.argsort(local[:, 2])
-        order = order[local[order, 2] > NEAR]
+        order = order[local[order, 2] > camera.least_depth(cameras)]
     x, y, z = local[order].unbind(-1)
-    across, down = matrix[0, 0], matrix[1, 1]
-    centres = torch.stack([across * x / z + matrix[0, 2], down * y / z + matrix[1, 2]], -1)
+    across, skew, down = matrix[0, 0], matrix[0, 1], matrix[1, 1]
+    centres = torch.stack([(across * x + skew * y) / z + matrix[0, 2], down * y / z + matrix[1, 2]], -1)
     # the axes of each Gaussian in pixels: the Jacobian of the projection times its axes in the camera's frame
     axes = pose[:3, :3] @ rotations_of(quaternions[order]) * scales[order, None]
-    right = across * (axes[:, 0] - (x / z)[:, None] * axes[:, 2]) / z[:, None]
-    below = down * (axes[:, 1] - (y / z)[:, None] * axes[:, 2]) / z[:, None]
+    right, below = ((axes[:, row] - (place / z)[:, None] * axes[:, 2]) / z[:, None] for row, place in enumerate((x, y)))
+    right, below = across * right + skew * below, down * below
     xx, yy = right.square().sum(-1) + DILATION, below.square().sum(-1) + DILATION
     xy = (right * below).sum(-1)
     determinant = xx * yy - xy.square()

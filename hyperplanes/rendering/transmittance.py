@@ -15,7 +15,7 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 __all__ = ["transmittance"]
 
 CELLS = 1 << 12  # processed together
-MAX_OPTICAL_DEPTH = 12.0  # beyond it the transmittance is zero in single precision
+MAX_OPTICAL_DEPTH = 12.0  # beyond it the transmittance is below 1e-5 and counts as zero
 
 
 def transmittance(

@@ -2,21 +2,25 @@
 is its target network, permuted views give the same field, a saved model is read back).
 """
 
+import copy
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes, InitialisationConfig, ModelConfig, checkpoints
 from hyperplanes.adaptation.network import in_use
 from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.export.baking import bake
+from hyperplanes.export.surfaces.mesh import extract_mesh
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import camera_from_world, centres, look_at, pinhole, viewing_directions
 from hyperplanes.geometry.cameras import intrinsics as calibration
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.hypernetwork import AutoencoderConfig, ImageHyperNetworkConfig
-from hyperplanes.rendering import Hierarchical
+from hyperplanes.rendering import Hierarchical, render
 from hyperplanes.utilities.files.checkpoints import CheckpointError
 from hyperplanes.views import Views
 from tests.reference_rendering import awaken, ball_views, ring, small_model
@@ -45,6 +49,20 @@ def test_an_untrained_model_is_its_target_network(model, support):
     plain.networks.load_state_dict(asleep.networks.state_dict())
     assert torch.equal(picture(asleep, support), picture(plain, support))
     assert not torch.equal(picture(model, support), picture(asleep, support))
+
+
+def test_a_model_in_double_precision_takes_points_of_either_and_is_exported(model, support):
+    points, directions = torch.rand(9, 3) - 0.5, torch.nn.functional.normalize(torch.rand(9, 3), dim=1)
+    single, double = model.adapt(support), copy.deepcopy(model).double().adapt(support)
+    for dtype in (torch.float32, torch.float64):
+        colour, density = double(points.to(dtype), directions.to(dtype))
+        assert colour.dtype == density.dtype == double.density(points.to(dtype)).dtype == dtype
+        torch.testing.assert_close(colour.float(), single(points, directions)[0], atol=1e-3, rtol=0)
+    torch.testing.assert_close(render(double, CAMERAS).images, render(single, CAMERAS).images, atol=1e-4, rtol=0)
+    assert bake(double, side=16).values.dtype == torch.float32
+    level = float(single.density(points).median())
+    found = [extract_mesh(field, voxels=12, level=level).vertices for field in (single, double)]
+    np.testing.assert_allclose(*found, atol=1e-3)
 
 
 def test_adapting_binds_theta_plus_delta(model, support):

@@ -98,14 +98,13 @@ def composited(splats, opacities, colours, one):
     for splat in torch.argsort(local[:, 2]):
         x, y, z = local[splat]
         fx, fy = matrix[0, 0], matrix[1, 1]
-        jacobian = torch.stack(
-            [fx * torch.stack([1 / z, 0 * z, -x / z**2]), fy * torch.stack([0 * z, 1 / z, -y / z**2])]
-        )
+        right, down = torch.stack([1 / z, 0 * z, -x / z**2]), torch.stack([0 * z, 1 / z, -y / z**2])
+        jacobian = torch.stack([fx * right + matrix[0, 1] * down, fy * down])
         axes = pose[:3, :3] @ rotations_of(quaternions[splat][None])[0]
         covariance = jacobian @ axes @ torch.diag(scales[splat] ** 2) @ axes.T @ jacobian.T + 0.3 * torch.eye(2).to(
             means
         )
-        away = pixels - torch.stack([fx * x / z + matrix[0, 2], fy * y / z + matrix[1, 2]])
+        away = pixels - one.project(means[splat][None])[0]
         power = (away @ torch.linalg.inv(covariance) * away).sum(-1, keepdim=True)
         inside = away.abs().amax(-1, keepdim=True) <= 3 * covariance.diagonal().max().sqrt()
         alpha = (opacities[splat] * torch.exp(-power / 2)).clamp_max(0.99)
@@ -114,7 +113,8 @@ def composited(splats, opacities, colours, one):
     return (picture + left).T.reshape(3, *camera.image_size(one))
 
 
-def test_the_picture_and_its_gradients_agree_with_autograd():
+@pytest.mark.parametrize("skew", [0.0, 4.0])
+def test_the_picture_and_its_gradients_agree_with_autograd(skew):
     generator = torch.Generator().manual_seed(1)
     parts = [
         0.4 * torch.randn(5, 3, generator=generator),
@@ -124,6 +124,7 @@ def test_the_picture_and_its_gradients_agree_with_autograd():
         torch.rand(5, 3, generator=generator),
     ]
     one = camera.pinhole(camera.symmetric_intrinsics(12, 12, 0.7), camera.fibonacci_sphere(3, 3.0)[1:2], 12, 12)
+    one.intrinsics[:, 0, 1] = skew
     truth = torch.rand(3, 12, 12, generator=generator)
     gradients, pictures = [], []
     for draw in (lambda *each: composited(each[:3], *each[3:], one), lambda *each: render_splats(*each, one)):
@@ -132,7 +133,17 @@ def test_the_picture_and_its_gradients_agree_with_autograd():
         (pictures[-1] - truth).square().mean().backward()
         gradients.append([leaf.grad for leaf in leaves])
     torch.testing.assert_close(pictures[1], pictures[0], atol=1e-5, rtol=0)
+    torch.testing.assert_close(render_splats(*parts, camera.to(one, dtype=torch.float64)), pictures[1].detach())
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-7, 1e4])
+def test_splats_do_not_depend_on_the_unit_of_the_world(splats, unit):
+    scaled = replace(splats, means=unit * splats.means, scales=unit * splats.scales)
+    poses = CAMERAS.extrinsics.clone()
+    poses[:, :3, 3] *= unit
+    found = scaled.render(camera.with_poses(CAMERAS, poses))
+    torch.testing.assert_close(found, splats.render(CAMERAS), atol=1e-2, rtol=0)
 
 
 def test_fitting_restores_changed_splats(splats):

@@ -16,6 +16,7 @@ from hyperplanes.export.surfaces import texture
 from hyperplanes.export.surfaces.mesh import extract_mesh
 from hyperplanes.export.surfaces.texture import save_textured, texture_surface
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.distortion import distorted
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast, pixel_grid
 from hyperplanes.rendering.renderer import RayMarching
@@ -109,6 +110,18 @@ def test_the_weight_of_a_view_decreases_towards_a_border_that_cuts_the_object(fi
     smooth = share_between()
     monkeypatch.setattr(texture, "margins", lambda masks: torch.zeros(len(masks), 4))
     assert share_between() < smooth / 4
+
+
+def test_a_view_whose_lens_does_not_show_a_texel_leaves_it_to_the_others(field):
+    """Beyond the radius at which a barrel distortion turns back, a lens shows nothing: pixels are NaN there."""
+    pinholes = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 1.0), camera.fibonacci_sphere(8, 2.0), SIZE, SIZE)
+    cameras = distorted(pinholes, torch.tensor([-4.0, 0.0, 0.0, 0.0, 0.0]))
+    surface = extract_mesh(field, voxels=24, level=6.0)
+    points = torch.from_numpy(np.array(surface.vertices, np.float32)).expand(8, -1, 3)
+    assert cameras.project(points).isnan().any(-1).float().mean() > 0.1
+    grey = Views(torch.full((8, 3, SIZE, SIZE), 0.5), cameras)
+    painted = texture_surface(surface, field, grey, faces=400, size=64).texture
+    assert float((painted.astype(int).max(-1) < 20).mean()) < 0.01
 
 
 def test_the_file_has_normals_a_texture_and_an_unlit_material(mesh, tmp_path):

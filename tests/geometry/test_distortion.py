@@ -9,7 +9,7 @@ from hyperplanes.data.pictures.bounds import estimate_bounds
 from hyperplanes.data.pictures.undistort import distort
 from hyperplanes.data.upright import upright, y_up_from
 from hyperplanes.export.images import orbit_cameras
-from hyperplanes.geometry import ImagePlanes, Sphere, cameras, carve, cast
+from hyperplanes.geometry import ImagePlanes, Sphere, cameras, carve, cast, distortion
 from hyperplanes.geometry.distortion import (
     DistortedCamera,
     distorted,
@@ -146,6 +146,20 @@ def test_lenses_are_kept():
     both = cameras.concatenate([lenses(), cameras.pinhole(K, poses(), HEIGHT, WIDTH)])
     assert isinstance(both, DistortedCamera)
     assert both.distortion[6:].abs().max() == 0
+
+
+def test_the_turning_radius_is_computed_once_until_the_lens_changes(monkeypatch):
+    made = []
+    monkeypatch.setattr(distortion, "turning_radius", lambda given: made.append(given) or turning_radius(given))
+    pinholes, points = cameras.pinhole(K, poses(), HEIGHT, WIDTH), some_points()
+    planes = ImagePlanes(torch.zeros(6, 1, HEIGHT, WIDTH, dtype=torch.float64), distorted(pinholes, LENS.repeat(6, 1)))
+    first = planes.lookup(points).coordinates
+    planes.lookup(points)
+    cast(planes.cameras, torch.tensor([0]), torch.zeros(1, 2, dtype=torch.float64))
+    assert len(made) == 1
+    planes.cameras.distortion.copy_(torch.zeros(6, 5))
+    assert not torch.equal(planes.lookup(points).coordinates, first)
+    assert len(made) == 2
 
 
 def test_no_distortion_changes_nothing():

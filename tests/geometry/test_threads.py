@@ -150,6 +150,22 @@ def test_all_functions_that_a_kernel_calls_are_inlined():
     assert all(function.targetoptions.get("forceinline") for function in functions)
 
 
+def test_a_pool_is_made_once_even_if_several_threads_ask_at_once(monkeypatch):
+    made = []
+
+    def make(size, name):
+        made.append(size)
+        time.sleep(0.05)  # so that others ask meanwhile
+        return object()
+
+    monkeypatch.setattr(threads, "ThreadPoolExecutor", make)
+    monkeypatch.setattr(threads, "_pools", {})
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(threads._pool, [3] * 4))
+    assert made == [3]
+    assert all(each is found[0] for each in found)
+
+
 def test_lookups_from_several_threads_at_once():
     expected = lookups(9000)
     with ThreadPoolExecutor(4) as pool:

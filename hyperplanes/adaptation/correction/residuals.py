@@ -40,7 +40,6 @@ TOLERANCE = 0.25  # distance from the surface that a support view sees, in radii
 DOUBT = 0.3  # weight of a residual of zero
 FAINT, SOLID = 0.01, 1 / 3  # opacities from which on a pixel is corrected in part, and in full
 PAIRS = 1 << 18  # of a pixel and a support view, processed at once
-VIEWS = 8  # support views that are rendered together
 MOST_PIXELS = 1 << 21  # of support views, such as 52 of 200x200, which take 20 s of two cores
 
 _rendering = RLock()  # so that two threads that need the same support views render them once
@@ -109,11 +108,10 @@ class ResidualField:
         Args:
             on_view: called with the number of views done.
         """
-        for first in range(0, len(self.views), VIEWS):
-            last = min(first + VIEWS, len(self.views))
-            self._compute(list(range(first, last)))
+        for view in range(len(self.views)):
+            self._compute([view])
             if on_view is not None:
-                on_view(last)
+                on_view(view + 1)
 
     def _blended(self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]) -> Tensor:
         """The weighted mean of the residuals of support views at points seen along these directions."""
@@ -148,16 +146,20 @@ class ResidualField:
         return (1 - cosines < WIDEST).any(0)
 
     def _compute(self, chosen: list[int]) -> None:
-        """Computes residual, depth times opacity, and opacity of the chosen support views, unless done already."""
+        """Computes residual, depth times opacity, and opacity of the chosen support views, unless done already.
+
+        One at a time: a picture depends a little on the others of its call (`AdaptedField.render`), and which views are
+        missing depends on the pictures before.
+        """
         with _rendering:
-            missing = [view for view in chosen if view not in self._known]
-            for first in range(0, len(missing), VIEWS):
-                some = missing[first : first + VIEWS]
-                own = self.uncorrected.render(camera.select(self._planes.cameras, some))
-                lacking = self.views.images[some].to(own.images) - own.images
+            for view in chosen:
+                if view in self._known:
+                    continue
+                own = self.uncorrected.render(camera.select(self._planes.cameras, [view]))
+                lacking = self.views.images[[view]].to(own.images) - own.images
                 maps = torch.cat([lacking, own.depth * own.opacity, own.opacity], 1)
-                self._planes.images[some] = maps.to(self._planes.images)
-                self._known.update(some)
+                self._planes.images[view] = maps[0].to(self._planes.images)
+                self._known.add(view)
 
 
 @dataclass(frozen=True, repr=False)

@@ -219,8 +219,8 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
     """The field of given weights, stacked with the visual hull if the model is configured so.
 
     The share of the hull is that for the object's own update (`hull_share`), whatever the weights are, or the one in
-    the configuration. With FEWEST views or more, the gating network of the model, if any, turns it into one for each
-    pixel.
+    the configuration. With FEWEST views or more, counting reflections, the gating network of the model, if any, turns
+    it into one for each pixel.
 
     Args:
         network: the model.

@@ -170,13 +170,16 @@ def _seen(
         facing = (offsets / distance[:, None] * outward).sum(-1)
         local = points @ camera.camera_from_world(one)[0, 2, :3] + camera.camera_from_world(one)[0, 2, 3]
         at = one.project(points[None])[0] / last * 2 - 1
-        at = torch.where((local > 1e-6)[:, None], at, 2.0)[None, None]
+        shown = (local > camera.least_depth(views.cameras)) & at.isfinite().all(
+            -1
+        )  # a lens may not show a point at all
+        at = torch.where(shown[:, None], at, 2.0)[None, None]
         first, span = grid_sample(maps, at, mode="nearest", align_corners=True)[0, :, 0]
         tolerance = TOLERANCE * pixel * distance / facing.clamp_min(OBLIQUE)
         visible = ((first - distance).abs() < tolerance) & (span < 3 * tolerance)  # and no depth edge beside it
         colour = grid_sample(views.images[view : view + 1], at, padding_mode="border", align_corners=True)[0, :, 0].T
-        shown = 1 - fading(borders[[view]], at[0, 0, :, None].clamp(-1, 1), views.size)
-        yield colour, facing.clamp_min(0)[:, None] ** SHARPNESS * visible[:, None] * shown
+        inner = 1 - fading(borders[[view]], at[0, 0, :, None].clamp(-1, 1), views.size)
+        yield colour, facing.clamp_min(0)[:, None] ** SHARPNESS * visible[:, None] * inner
 
 
 def _spread(

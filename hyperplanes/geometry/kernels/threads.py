@@ -154,9 +154,10 @@ def _run_operations_alone() -> None:
 
 
 def _pool(size: int, purpose: str = "kernels") -> ThreadPoolExecutor:
-    if (size, purpose) not in _pools:
-        _pools[size, purpose] = ThreadPoolExecutor(size, f"hyperplanes-{purpose}")
-    return _pools[size, purpose]
+    with _making:
+        if (size, purpose) not in _pools:
+            _pools[size, purpose] = ThreadPoolExecutor(size, f"hyperplanes-{purpose}")
+        return _pools[size, purpose]
 
 
 def _forget() -> None:

@@ -356,7 +356,7 @@ class _Maps:
 
     @property
     def complete(self) -> Float[Tensor, "view height width 2"]:
-        """The values with their depths, which are computed once.
+        """The values with their depths, which are computed once: cameras and occupancy must not change after that.
 
         They are constants under function transforms, but computed anew where a transform made the tensors.
         """
