@@ -23,7 +23,7 @@ from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data import read_task
 from hyperplanes.export.baking import BakedScene, bake, default_side
 from hyperplanes.export.splats import fit_splats, splats_of
-from hyperplanes.export.voxel_fitting import STEPS, fit_voxels
+from hyperplanes.export.voxel_fitting import STEPS, fit_voxels, render_guide
 from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task
 
@@ -59,7 +59,8 @@ def measure(model: HyperPlanes, task: Task, voxel_steps: int = STEPS, splat_step
     baked = bake(field, side=default_side(shown.size))
     fit_splats(splats_of(baked), shown, steps=1)  # compiles kernels before the measurement
     voxel_seconds, baked = timed(lambda: fit_voxels(baked, shown, steps=voxel_steps))
-    splat_seconds, splats = timed(lambda: fit_splats(splats_of(baked), shown, steps=splat_steps))
+    guide = render_guide(BakedScene(baked), shown, size=shown.size)
+    splat_seconds, splats = timed(lambda: fit_splats(splats_of(baked), shown, guide=guide, steps=splat_steps))
     scene = BakedScene(baked)
     scene.render(asked[:1].cameras)
     reference_seconds, voxels = timed(lambda: scene.render(asked.cameras).images)

@@ -289,7 +289,9 @@ def _captures_masks(result: Result) -> str:
     lines = [["as `capture` found them", *(f"{row['psnr']:.2f} dB ({row['mask_iou']:.3f})" for row in rows)]]
     for way, label in WAYS.items():
         shares = (f" ({row[f'mask_iou_{way}']:.3f})" if f"mask_iou_{way}" in row else "" for row in rows)
-        lines.append([label, *(f"{row[f'psnr_{way}']:.2f} dB{share}" for row, share in zip(rows, shares, strict=True))])
+        found = [row[f"psnr_{way}"] for row in rows]  # null where nothing could be rendered
+        quality = ["-" if psnr is None else f"{psnr:.2f} dB" for psnr in found]
+        lines.append([label, *(map("".join, zip(quality, shares, strict=True)))])
     return markdown_table(["masks", *(row["name"] for row in rows)], lines)
 
 

@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import json
+import math
 import os
 import re
 import subprocess
@@ -23,13 +24,14 @@ from benchmarks import gpu, image_based, steps, tables, views
 from benchmarks.parts import load as machine_load
 from benchmarks.parts import timing as _timing
 from benchmarks.parts.load import OF_SPEED
+from benchmarks.parts.reporting import write_rows
 from benchmarks.training import step_parts
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.correction import stacking
 from hyperplanes.fields import TARGETS, ImageBasedNeRF
 from hyperplanes.rendering import RayMarching, renderer
 from hyperplanes.training import Trainer, TrainingConfig
-from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.files.reading import DataError, read_json
 from hyperplanes.utilities.machine.environment import usable_cores
 from tests.reference_rendering import Balls
 from tests.training.test_volume_loss import MODEL
@@ -328,6 +330,11 @@ def test_implementations_that_failed_have_empty_cells(tmp_path):
     assert "200x200 | - | 2 ms | 2 ms | 1.0 | - / 30.00 / 30.00 | - |" in found["gpu"]
     assert "| no TF32 | - | 2.0 ms, 30.00 dB |" in found["gpu_ways"]
     assert not any("CUDA graph" in text for text in found.values())
+
+
+def test_rows_with_numbers_that_are_not_finite_are_valid_json(tmp_path):
+    write_rows("captures", [{"name": "lost", "psnr": math.nan, "psnr_given": math.inf}], tmp_path / "rows.json")
+    assert read_json(tmp_path / "rows.json")["rows"] == [{"name": "lost", "psnr": None, "psnr_given": None}]
 
 
 def test_tables_of_views_take_the_rows_of_all_suites(tmp_path):

@@ -217,8 +217,45 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
             ["--support: planes: expected a whole number"],
         ),
         (["train", "--data", "DATA", "--device", "abacus", "--out", "OUT/run"], ["device", "abacus"]),
+        *(
+            (["train", "--data", "DATA", "--out", "OUT/run", *options.split()], ["expected one of the two, got both"])
+            for options in (
+                "--training.steps 5 --steps 6",
+                "--training.epochs 5 --epochs 6",
+                "--training.epochs 5 --steps 6",
+                "--training.steps 5 --training.epochs 2",
+                "--seed 1 --training.seed 2",
+                "--cache-size 1 --training.memory 5",
+                "--support 4 --model.network.planes 3",
+                "--protocol paper --model.protocol ray_marching",
+                "--field nerf --model.target multiplane",
+            )
+        ),
+        (
+            ["train", "--data", "DATA", "--method", "nerf", "--model.initialisation.steps", "3", "--out", "OUT/run"],
+            ["--method nerf: expected --model settings of this method, got those of mv_meta"],
+        ),
+        (
+            ["evaluate", "--data", "DATA", "--method", "nearest_view", "--json", "OUT/a.json", "--csv", "OUT/a.json"],
+            ["--csv, --json: expected a file each, got", "twice"],
+        ),
+        (
+            ["reproduce", "target", "--scale", "smoke", "--data", "car=OUT/none", "--out", "OUT/rep"],
+            ["--data car=OUT/none: expected the folder of a data set, found nothing"],
+        ),
+        (
+            ["reproduce", "target", "--scale", "smoke", "--legacy", "--out", "OUT/rep"],
+            ["--legacy: expected --data as well, got none"],
+        ),
+        (["demo", "--preset", "huge", "--out", "OUT/demo"], ["preset: expected one of quick, small", "'huge'"]),
+        (["demo", "--steps", "0", "--out", "OUT/demo"], ["--steps: expected a whole number from 1"]),
         (["train", "--data", "DATA", "--preset", "small", "--support", "5", "--out", "OUT/run"], ["--training.views"]),
         (["evaluate", "--data", "DATA", "--method", "magic"], ["nearest_view", "magic"]),
+        (
+            ["evaluate", "--data", "DATA", "--method", "nearest_view", "--preset", "huge"],
+            ["preset: expected one of", "huge"],
+        ),
+        (["inspect", "small", "--checksums"], ["--checksums: expected a data set, got small"]),
         (["evaluate", "--data", "DATA", "--method", "nearest_view", "--boxes", "OUT/a.gfi"], ["OUT/a.gfi", "png"]),
         (["evaluate", "--data", "DATA", "--method", "hyperplanes"], ["checkpoint", "hyperplanes train"]),
         (
@@ -247,7 +284,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ),
         (
             ["train", "--data", "DATA", "--steps", "3", "--epochs", "1", "--out", "OUT/run"],
-            ["--steps, --epochs: expected one of the two, got 3 and 1"],
+            ["--steps, --epochs: expected one of the two, got both"],
         ),
         (
             [
@@ -278,7 +315,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         ),
         (
             ["train", "--data", "DATA", "--training.steps", "3", "--epochs", "1", "--out", "OUT/run"],
-            ["--training.steps, --epochs: expected one of the two, got both"],
+            ["--epochs, --training.steps: expected one of the two, got both"],
         ),
         *(
             (["train", "--data", "DATA", "--cache-size", size, "--out", "OUT/run"], ["--cache-size: expected GiB"])
@@ -1055,7 +1092,7 @@ def test_the_demonstration_repeats_no_finished_step(capsys):
     capsys.readouterr()
     with small_demo():
         assert main(["demo", "--quick-check", "--out", str(demo)]) == 0
-    assert capsys.readouterr().out.count("done before") == 16
+    assert capsys.readouterr().out.count("done before") == 18
     assert {path: path.stat().st_mtime_ns for path in demo.rglob("*") if path.is_file()} == before
 
 
@@ -1103,7 +1140,9 @@ def test_training_continues_after_ctrl_c_with_the_same_result(tmp_path, monkeypa
     assert main([*command, str(whole)]) == 0
     assert capsys.readouterr().out.count("trained for 4 steps\n") == 1
     assert main([*command[:6], "3", *command[7:], str(whole)]) == 0
-    assert "trained for 4 steps before; nothing was trained now, because --steps is 3" in capsys.readouterr().out
+    assert (
+        "trained for 4 steps before; nothing was trained now, because the settings ask for 3" in capsys.readouterr().out
+    )
     same = (parts / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
     assert same
 

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from benchmarks.parts.load import load_at_start
-from hyperplanes.utilities.files.writing import write_whole
+from hyperplanes.utilities.files.writing import finite, write_whole
 from hyperplanes.utilities.machine.environment import environment
 
 __all__ = ["Row", "finish", "write_rows"]
@@ -38,4 +38,4 @@ def write_rows(name: str, rows: list[Row], json_file: Path, device: str = "cpu",
     """Write rows with the commit, the hardware, the load, and further entries."""
     machine = environment() | {"load": round(load_at_start(), 2)}
     content = {"benchmark": name, "device": device, **machine, **about, "rows": rows}
-    write_whole(json_file, (json.dumps(content, indent=2) + "\n").encode())
+    write_whole(json_file, (json.dumps(finite(content), indent=2) + "\n").encode())

@@ -148,12 +148,11 @@ def run(arguments: Arguments) -> int:
 
 
 def _inspect(arguments: Arguments, console: Console) -> int:
-    if arguments.path.suffix == ".safetensors" and arguments.path.is_file():
-        for line in baked_lines(arguments.path):
-            console.say(line)
-        return 0
-    if _is_checkpoint(arguments.path):
-        for line in checkpoint_lines(arguments.path):
+    is_baked = arguments.path.suffix == ".safetensors" and arguments.path.is_file()
+    if is_baked or _is_checkpoint(arguments.path):
+        if arguments.checksums:
+            raise ValueError(f"--checksums: expected a data set, got {arguments.path}, a model or a baked file")
+        for line in baked_lines(arguments.path) if is_baked else checkpoint_lines(arguments.path):
             console.say(line)
         return 0
     from data_gen.datasets.inspect import inspect

@@ -89,8 +89,8 @@ class GenerationConfig:
             )
         if self.field_of_view is not None and layout.field_of_view not in (None, self.field_of_view):
             raise ValueError(
-                f"field_of_view: the {self.layout} layout's loaders assume {layout.field_of_view:.4g} degrees, "
-                f"got {self.field_of_view:g}"
+                f"field_of_view: the {self.layout} layout's loaders assume {layout.field_of_view:.10g} degrees, "
+                f"got {self.field_of_view:g}; leave it out"
             )
         if not 1 <= self.supersample <= MAX_SUPERSAMPLE:
             raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, got {self.supersample}")

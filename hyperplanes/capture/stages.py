@@ -50,6 +50,7 @@ class Stages:
         if record.get("key") == key and record.get("done") and isinstance(record.get("result"), dict):
             return record["result"]
         if record.get("key") != key:
+            self._path(name).unlink(missing_ok=True)  # first, so that an interruption leaves no record of deleted files
             shutil.rmtree(self.folder / name, ignore_errors=True)
             (self.folder / name).mkdir(parents=True)
             write_json(self._path(name), {"key": key, "done": False})

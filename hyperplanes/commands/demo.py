@@ -63,7 +63,7 @@ class Arguments:
     held_out: int = 5
     resolution: int = 64
     preset: str = "quick"
-    steps: int = 800
+    steps: Annotated[int, range(1, 10**10)] = 800
     meshes: OptionalFolder = None
     first_only: bool = False
     seed: int = 0
@@ -78,6 +78,7 @@ def settings_of(arguments: Arguments) -> DemoSettings:
     Raises:
         ValueError: too few objects or pixels, or no folder of meshes.
     """
+    from hyperplanes.configuration.presets import preset
     from hyperplanes.experiments.demonstration.settings import DemoSettings
 
     if arguments.meshes is not None and not arguments.meshes.is_dir():
@@ -99,6 +100,7 @@ def settings_of(arguments: Arguments) -> DemoSettings:
         )
     if arguments.resolution < 16:
         raise ValueError(f"--resolution: expected at least 16 pixels, got {arguments.resolution}")
+    preset(arguments.preset)  # a wrong name is found before anything is made
     given = {each.name for each in fields(DemoSettings)} & {each.name for each in fields(Arguments)}
     return DemoSettings(**{name: getattr(arguments, name) for name in given})
 

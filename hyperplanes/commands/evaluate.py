@@ -206,7 +206,7 @@ def run(arguments: Arguments) -> int:
 
     def failed(method: str, seed: int, name: str, error: Exception) -> None:
         failures[name] = f"{method}: {error}"
-        bar.warn(f"{name} is left out, {method} failed: {error}")
+        bar.warn(f"{name} is left out, {method} failed: {str(error).removeprefix(f'{name}: ')}")
 
     with console.bar("evaluating") as bar:
         scores = evaluate_all(
@@ -224,6 +224,8 @@ def run(arguments: Arguments) -> int:
     console.table(headings(scores), rows(scores))
     if count > 1 and pairs:
         console.table(PAIR_HEADINGS, compared_rows(pairs[:LARGEST_TABLE]))
+        if (more := len(pairs) - LARGEST_TABLE) > 0:
+            console.say(f"{counted(more, 'more pair')} with smaller differences: --markdown FILE writes all of them")
     console.say(f"{counted(count, 'object')} of {arguments.data}{_of_seeds(arguments)}")
     if line := _of_shown(scores):
         console.warn(line)
@@ -247,8 +249,10 @@ def run(arguments: Arguments) -> int:
 
 def _check(arguments: Arguments) -> None:
     """Refuse wrong options before anything is read."""
+    from hyperplanes.configuration.presets import preset
     from hyperplanes.utilities.images.plots import figure_kind
 
+    preset(arguments.preset)  # a wrong name is found even if no method needs it
     if not arguments.method:
         raise ValueError("--method: expected at least one, got none")
     if arguments.curve is not None and len(arguments.steps) < 2:
@@ -265,6 +269,11 @@ def _check(arguments: Arguments) -> None:
             figure_kind(figure)  # a wrong name is found before anything is evaluated
     for option in OUTPUTS:
         check_output(option, getattr(arguments, option))
+    files = {path.resolve(): f"--{option}" for option in OUTPUTS if (path := getattr(arguments, option)) is not None}
+    for option in OUTPUTS:
+        path = getattr(arguments, option)
+        if path is not None and files[path.resolve()] != f"--{option}":
+            raise ValueError(f"--{option}, {files[path.resolve()]}: expected a file each, got {path} twice; rename one")
     for option in ("seeds", "objects", "support", "query"):
         if (number := getattr(arguments, option)) is not None and number < 1:
             raise ValueError(f"--{option}: expected at least 1, got {number}")

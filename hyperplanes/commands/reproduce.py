@@ -80,7 +80,7 @@ def data_sets(given: Sequence[str], classes: Collection[str]) -> dict[str, Path]
         classes: the known classes.
 
     Raises:
-        ValueError: another form, an unknown class, or one class twice.
+        ValueError: another form, an unknown class, one class twice, or no such folder.
     """
     found: dict[str, Path] = {}
     for each in given:
@@ -89,6 +89,10 @@ def data_sets(given: Sequence[str], classes: Collection[str]) -> dict[str, Path]
             known = ", ".join(classes)
             raise ValueError(f"--data: expected CLASS=FOLDER, each of the classes {known} once, got {each!r}")
         found[name] = Path(folder)
+    for name, folder in found.items():
+        if not folder.is_dir():
+            what = "a file" if folder.exists() else "nothing"
+            raise ValueError(f"--data {name}={folder}: expected the folder of a data set, found {what}; check the path")
     return found
 
 
@@ -112,6 +116,8 @@ def run(arguments: Arguments) -> int:
     seeds = scale.seeds(experiment) if arguments.seeds is None else arguments.seeds
     if seeds < 1:
         raise ValueError(f"--seeds: expected at least 1, got {seeds}")
+    if arguments.legacy and not arguments.data:
+        raise ValueError("--legacy: expected --data as well, got none; generated data sets are read in one way only")
 
     def found(cell: Cell, seed: int, score: ObjectScore, *_: int) -> None:
         console.say(f"{cell.row}, {cell.column}, seed {seed}: {score.name} {score.psnr:.2f} dB")

@@ -24,11 +24,11 @@ Example:
 from __future__ import annotations
 
 import signal
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -56,6 +56,17 @@ __all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 
 
 BROUGHT = {"Fields": "hyperplanes.fields"}
+
+SAME = {
+    "steps": ("training.steps", "training.epochs"),
+    "epochs": ("training.epochs", "training.steps"),
+    "seed": ("training.seed",),
+    "cache_size": ("training.memory",),
+    "support": ("model.network.planes",),
+    "field": ("model.target",),
+    "protocol": ("model.protocol",),
+}
+"""The settings that an option sets, too."""
 """Groups of entry points whose names are fields and methods, by their heading in the help."""
 
 
@@ -197,12 +208,17 @@ def resolve(arguments: Arguments) -> Preset:
     Raises:
         ValueError: an unknown name, or an invalid value; the message names the file or the option.
     """
-    from hyperplanes.configuration.presets import preset
+    from hyperplanes.configuration.presets import TRAINABLE, preset
     from hyperplanes.configuration.settings_file import changed, parse_options, read_experiment
     from hyperplanes.utilities.files.settings import SettingsError
     from hyperplanes.utilities.messages.errors import prefix_errors
 
     given = read_experiment(arguments.config) if arguments.config else {}
+    try:
+        stated = parse_options(arguments.settings)
+    except SettingsError as error:
+        raise ValueError(f"--{error.path.replace('_', '-')}: {error.problem}") from None
+    _refuse_both(arguments, stated)
     chosen = preset(arguments.preset or given.get("preset", "quick"))
     if "method" in given:
         chosen = chosen.by_method(given["method"])
@@ -217,10 +233,6 @@ def resolve(arguments: Arguments) -> Preset:
         raise ValueError(f"--epochs: expected at least 1, got {arguments.epochs}")
     options = {"steps": arguments.steps, "epochs": arguments.epochs, "seed": arguments.seed}
     if arguments.steps is not None:
-        if arguments.epochs:
-            raise ValueError(
-                f"--steps, --epochs: expected one of the two, got {arguments.steps} and {arguments.epochs}"
-            )
         options["epochs"] = 0
     if arguments.cache_size is not None:
         if not 0 <= arguments.cache_size < 2**20:
@@ -233,11 +245,7 @@ def resolve(arguments: Arguments) -> Preset:
             except SettingsError as error:
                 raise ValueError(f"--{'cache-size' if name == 'memory' else name}: {error.problem}") from None
     try:
-        stated = parse_options(arguments.settings)
-        training = stated.get("training", {})
-        if "steps" in training and "epochs" not in training:
-            if arguments.epochs:
-                raise ValueError("--training.steps, --epochs: expected one of the two, got both; leave one out")
+        if "steps" in (training := stated.get("training", {})):
             training["epochs"] = 0
         chosen = changed(chosen, stated)
     except SettingsError as error:
@@ -245,8 +253,42 @@ def resolve(arguments: Arguments) -> Preset:
     if arguments.support is not None:
         with prefix_errors("--support"):
             network = replace(chosen.model.network, planes=arguments.support)
-        chosen = replace(chosen, model=replace(chosen.model, network=network))
+            chosen = replace(chosen, model=replace(chosen.model, network=network))
+    if arguments.method in TRAINABLE and chosen.model.method != arguments.method:
+        raise ValueError(
+            f"--method {arguments.method}: expected --model settings of this method, got those of "
+            f"{chosen.model.method}; leave one out"
+        )
     return chosen
+
+
+def _refuse_both(arguments: Arguments, stated: Mapping[str, Any]) -> None:
+    """Refuse two options for the same setting, of which one would be ignored.
+
+    Args:
+        arguments: the options of the verb.
+        stated: the entries of its options with dots.
+
+    Raises:
+        ValueError: such a pair.
+    """
+    options = [name for name in SAME if getattr(arguments, name) not in (None, "default")]
+    settings = _names(stated) - ({"training.epochs"} if not stated.get("training", {}).get("epochs") else set())
+    both = [(name, setting) for name in options for setting in SAME[name] if setting in settings]
+    for lengths in (options, settings):
+        names = [name for name in ("steps", "epochs", "training.steps", "training.epochs") if name in lengths]
+        both += [names] if len(names) == 2 else []
+    if both:
+        pair = ", ".join(f"--{name.replace('_', '-')}" for name in both[0])
+        raise ValueError(f"{pair}: expected one of the two, got both; leave one out")
+
+
+def _names(stated: Mapping[str, Any], before: str = "") -> set[str]:
+    """The names of nested entries, with dots."""
+    found = set()
+    for name, value in stated.items():
+        found |= _names(value, f"{before}{name}.") if isinstance(value, Mapping) else {before + name}
+    return found
 
 
 def _is_first(arguments: Arguments) -> bool:
@@ -309,6 +351,7 @@ def _run(arguments: Arguments) -> int:
     held_out = len(data.names("test"))
     with launched(*processes, choose_device(arguments.device)) as device:
         trainer = start_training(chosen.model, chosen.training, tasks, arguments.out, device, reference)
+        begun = trainer.step
         if first:
             write_experiment(arguments.out / "config.yaml", chosen)
         shared = f", shared by {trainer.processes.count} processes" if trainer.processes.count > 1 else ""
@@ -326,8 +369,8 @@ def _run(arguments: Arguments) -> int:
         finally:
             if board is not None:
                 board.close()
-    more = trainer.step > chosen.training.steps
-    before = f" before; nothing was trained now, because --steps is {chosen.training.steps}" if more else ""
+    more, asked = begun > trainer.config.steps, trainer.config.steps
+    before = f" before; nothing was trained now, because the settings ask for {asked}" if more else ""
     console.say(f"{arguments.out}: trained for {trainer.step} steps{before}")
     if held_out:
         given = ["--data", arguments.data[0], "--checkpoint", arguments.out, "--method", method]

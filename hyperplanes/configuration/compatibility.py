@@ -70,7 +70,8 @@ def _check_hypernetwork(config: ModelConfig, target: type[Target]) -> None:
             )
     elif reader.views > config.network.planes:
         planes = config.network.planes
-        raise ValueError(f"views: expected at most as many HyperPlanes as planes, {planes}, got {reader.views}")
+        kind = "autoencoder" if hypernetwork is None else "hypernetwork"
+        raise ValueError(f"{kind}.views: expected at most as many as planes, {planes}, got {reader.views}")
 
 
 def check_fine_tuning(settings: FineTuning, steps: Steps, views: int, config: ModelConfig, target: Target) -> None:

@@ -25,8 +25,9 @@ def choose_device(name: str) -> torch.device:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # fails on the device meta, whose tensors have no data
     except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"device: expected auto, cpu or one that torch has here, got {name!r} ({reason})") from None
+        kind, reason = name.partition(":")[0], str(error).splitlines()[0]
+        why = f" ({reason})" if kind in ("cuda", "mps", "xpu") else ""  # of other names, torch lists all its types
+        raise ValueError(f"device: expected auto, cpu or one that torch has here, got {name!r}{why}") from None
     return device
 
 

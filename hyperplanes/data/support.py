@@ -166,6 +166,10 @@ class Inputs(TaskWrapper):
         if max(self.places) >= len(views):
             found = " ".join(map(str, self.places))
             raise ValueError(f"{task.name}: expected inputs from 0 to {len(views) - 1}, got {found}; name other views")
+        if len(self.places) == len(views):
+            raise ValueError(
+                f"{task.name}: expected fewer inputs than its {len(views)} views, got all of them; leave out some"
+            )
         inputs = [order[place] for place in self.places]
         rest = [index for index in order if index not in inputs]
         return replace(task, support=views[inputs], query=views[rest])

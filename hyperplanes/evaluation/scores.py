@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from statistics import fmean, pstdev, stdev
+from statistics import fmean, stdev
 from typing import Any
 
 from jaxtyping import Float
@@ -27,6 +27,9 @@ QUANTITIES = (
     "query_views_shown",
 )
 """The numbers of an `ObjectScore`, in the order of the tables."""
+
+ALWAYS = ("psnr", "ssim", "adapt_seconds", "render_seconds")
+"""Those that every object has."""
 
 Perceptual = Callable[[Float[Tensor, "view 3 h w"], Float[Tensor, "view 3 h w"]], Float[Tensor, " view"]]
 """LPIPS, such as `perceptual.LPIPS`: (predicted, truth) -> one distance per image."""
@@ -59,8 +62,9 @@ class ObjectScore:
     query_views_shown: float | None = None
 
     def as_json(self) -> dict[str, float]:
-        """The numbers that were measured, by name."""
-        return {name: value for name in QUANTITIES if (value := getattr(self, name)) is not None}
+        """The numbers that were measured, by name, without NaN."""
+        numbers = {name: getattr(self, name) for name in QUANTITIES}
+        return {name: value for name, value in numbers.items() if value is not None and not math.isnan(value)}
 
     @property
     def image_seconds(self) -> float:
@@ -88,9 +92,9 @@ class Score:
         return fmean(found) if found else math.nan
 
     def spread(self, quantity: str) -> float:
-        """Standard deviation of a number over the objects that have it; NaN if none has, or if one is not finite."""
+        """Standard deviation of a number over the objects that have it; NaN for fewer than two, or infinite numbers."""
         found = self._numbers(quantity)
-        return pstdev(found) if found and all(map(math.isfinite, found)) else math.nan
+        return stdev(found) if len(found) > 1 and all(map(math.isfinite, found)) else math.nan
 
     def _numbers(self, quantity: str) -> list[float]:
         """A number of every object that has it."""
@@ -117,10 +121,14 @@ class Score:
 
     @classmethod
     def of_json(cls, method: str, value: Mapping[str, Any]) -> Score:
-        """The row from the result of `as_json`; null is read as infinity, because JSON has no infinity."""
+        """The row from the result of `as_json`.
+
+        JSON has neither infinity nor NaN: null is read as infinity, and a missing number that every object has as NaN.
+        """
 
         def score(name: str, numbers: Mapping[str, float | None]) -> ObjectScore:
-            return ObjectScore(name, **{key: math.inf if each is None else each for key, each in numbers.items()})
+            known = {key: math.inf if each is None else each for key, each in numbers.items()}
+            return ObjectScore(name, **dict.fromkeys(ALWAYS, math.nan) | known)
 
         objects = tuple(score(name, numbers) for name, numbers in value["objects"].items())
         return cls(method, objects, tuple(cls.of_json(method, seed) for seed in value.get("seeds", ())))

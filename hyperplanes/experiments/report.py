@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from statistics import fmean, pstdev
+from statistics import fmean, stdev
 from typing import Any
 
 from hyperplanes.configuration.initialisation import LEARNED
@@ -29,7 +29,7 @@ def value(score: Score, quantity: str) -> tuple[float, float | None]:
     """A number of the table and its standard deviation: over seeds, if there are several; for seconds, over objects."""
     if quantity == "image_seconds":
         seconds = [each.image_seconds for each in score.objects]
-        return fmean(seconds), pstdev(seconds)
+        return fmean(seconds), stdev(seconds) if len(seconds) > 1 else None
     return score.mean(quantity), score.deviation(quantity)
 
 

@@ -307,7 +307,7 @@ def config_of(model):
         ("network", {"density_scale": float("inf")}, "network.density_scale: expected finite numbers, got inf"),
         ("hypernetwork", {"layers": "colour"}, "hypernetwork.layers: expected a tuple of str, got 'colour'"),
         ("hypernetwork", {"encoder": "vgg"}, "encoder: expected one of .*, got 'vgg'"),
-        ("hypernetwork", {"views": 5}, "views: expected at most as many HyperPlanes as planes, 4, got 5"),
+        ("hypernetwork", {"views": 5}, "hypernetwork.views: expected at most as many as planes, 4, got 5"),
         (None, {"target": "voxels"}, "target: expected one of .*, got 'voxels'"),
         (None, {"target": 3}, "target: expected str, got 3"),
         (None, {"hull_resolution": 10**6}, "hull_resolution: expected a whole number from 1 to 512, got 1000000"),
@@ -384,7 +384,7 @@ def test_a_hypernetwork_and_an_autoencoder_together_are_refused():
 
 
 def test_more_hyperplanes_than_planes_are_refused():
-    with pytest.raises(ValueError, match="views: expected at most as many HyperPlanes as planes, 4, got 5"):
+    with pytest.raises(ValueError, match="hypernetwork.views: expected at most as many as planes, 4, got 5"):
         small_model(hypernetwork=ImageHyperNetworkConfig(views=5))
 
 

@@ -175,5 +175,8 @@ def test_broken_models_are_named(scene, tmp_path):
     fisheye = write(scene, tmp_path / "fisheye", "OPENCV_FISHEYE", (0.1, 0, 0, 0))
     with pytest.raises(DataError, match="camera models SIMPLE_PINHOLE, .*, found OPENCV_FISHEYE; run COLMAP's"):
         read_colmap(fisheye, fisheye)
+    (path.parent / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 1, 5, 4, 4, *range(4)))
+    with pytest.raises(DataError, match="camera models SIMPLE_PINHOLE, .*, found OPENCV_FISHEYE; run COLMAP's"):
+        read_colmap(folder, folder)
     with pytest.raises(DataError, match="expected cameras and images, .bin or .txt, found neither"):
         read_colmap(tmp_path, tmp_path)

@@ -7,6 +7,8 @@ import pytest
 
 from hyperplanes.evaluation import ObjectScore, Score, merge_seeds
 from hyperplanes.evaluation.comparison import compare, compare_all
+from hyperplanes.utilities.files.reading import read_json
+from hyperplanes.utilities.files.writing import write_json
 
 
 def score(method, values, **numbers):
@@ -55,7 +57,7 @@ def test_seeds_are_averaged_object_by_object():
     assert merged.objects[0].psnr_foreground is None  # one of the seeds has none
     assert merged.mean("psnr") == 26.5
     assert merged.deviation("psnr") == pytest.approx(3 / 2**0.5)  # the means of the seeds are 25 and 28
-    assert merged.spread("psnr") == pytest.approx(5.5)
+    assert merged.spread("psnr") == pytest.approx(11 / 2**0.5)
     assert merge_seeds([score("a", [20.0])]).deviation("psnr") is None
     with pytest.raises(ValueError, match="expected the same objects for every seed"):
         merge_seeds([score("a", [20.0]), score("a", [20.0, 21.0])])
@@ -64,3 +66,14 @@ def test_seeds_are_averaged_object_by_object():
 def test_scores_come_back_from_json():
     merged = merge_seeds([score("a", [20.0, 30.0], psnr_pooled=19.0), score("a", [22.0, 34.0], psnr_pooled=21.0)])
     assert Score.of_json("a", merged.as_json()) == merged
+
+
+def test_numbers_that_are_not_finite_come_back_from_a_file(tmp_path):
+    write_json(tmp_path / "score.json", score("a", [math.inf, math.nan, 20.0]).as_json())
+    found = Score.of_json("a", read_json(tmp_path / "score.json"))
+    assert [each.psnr for each in found.objects] == pytest.approx([math.inf, math.nan, 20.0], nan_ok=True)
+
+
+def test_the_spread_is_the_sample_standard_deviation():
+    assert score("a", [20.0, 22.0]).spread("psnr") == pytest.approx(np.std([20.0, 22.0], ddof=1))
+    assert math.isnan(score("a", [20.0]).spread("psnr"))

@@ -177,4 +177,4 @@ def test_each_of_several_trainings_is_recorded_when_it_ends(tmp_path, monkeypatc
     assert {name: written[name]["done"] for name in written} == {"point_multiplane": True, "hyperplanes": False}
     assert written["point_multiplane"]["seconds"] < written["hyperplanes"]["seconds"]
     evaluated = {args[0].cell.method for name, args, _ in workers.submitted if name == "_evaluate"}
-    assert evaluated == {"point_multiplane", "scratch_2", "nearest_view"}, "evaluations start meanwhile"
+    assert evaluated == {"point_multiplane", "scratch_2", "nearest_view", "hull_blend"}, "evaluations start meanwhile"

@@ -61,5 +61,5 @@ def test_it_learns_to_distinguish_objects(tmp_path):
 def test_wrong_settings_are_refused():
     with pytest.raises(ValueError, match="encoder: expected one of 'convnet', 'resnet101', got 'vit'"):
         AutoencoderConfig(encoder="vit")
-    with pytest.raises(ValueError, match="views: expected at most as many HyperPlanes as planes, 4, got 5"):
+    with pytest.raises(ValueError, match="autoencoder.views: expected at most as many as planes, 4, got 5"):
         small_model(hypernetwork=None, autoencoder=AutoencoderConfig(views=5))

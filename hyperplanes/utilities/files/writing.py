@@ -15,7 +15,7 @@ from pathlib import Path
 from hyperplanes.utilities.files.encoding import encode_json
 from hyperplanes.utilities.files.reading import DataError
 
-__all__ = ["WriteError", "one_writer", "write_folder", "write_json", "write_whole"]
+__all__ = ["WriteError", "finite", "one_writer", "write_folder", "write_json", "write_whole"]
 
 _unfinished = itertools.count()
 
@@ -157,14 +157,15 @@ def _is_running(process: int) -> bool:
 
 def write_json(path: str | Path, value: object) -> None:
     """Write a JSON file atomically; infinities and NaN, which JSON lacks, become null."""
-    write_whole(path, encode_json(_finite(value)))
+    write_whole(path, encode_json(finite(value)))
 
 
-def _finite(value: object) -> object:
+def finite(value: object) -> object:
+    """A value for JSON, which has no infinities and no NaN: they become None."""
     if isinstance(value, Mapping):
-        return {name: _finite(part) for name, part in value.items()}
+        return {name: finite(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
+        return [finite(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

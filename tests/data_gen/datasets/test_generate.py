@@ -289,7 +289,7 @@ def test_a_full_disk_is_a_one_line_error_and_leaves_no_partial_files(tmp_path, m
         ({"lighting": "sun"}, "lighting: expected one of studio, headlight, random, got 'sun'"),
         (
             {"layout": "hyperplanes-200", "field_of_view": 60.0},
-            "field_of_view: the hyperplanes-200 layout's loaders assume 39.6",
+            "field_of_view: the hyperplanes-200 layout's loaders assume 39.59877529 degrees, got 60; leave it out",
         ),
         ({"held_out": 9}, "held_out: expected a fraction below 1 or a count up to 5 of each class, got 9"),
     ],

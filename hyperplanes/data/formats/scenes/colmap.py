@@ -29,6 +29,10 @@ _MODELS = {
     4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
     6: ("FULL_OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
 }
+_OTHER_MODELS = {  # names for messages
+    **{5: "OPENCV_FISHEYE", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE", 10: "THIN_PRISM_FISHEYE"},
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
+}
 _PARAMETERS = dict(_MODELS.values())
 _PLACES = ("sparse", "dense/sparse", "dense", "distorted/sparse", "colmap/sparse", "colmap")
 
@@ -231,7 +235,7 @@ def _cameras_binary(path: Path) -> dict[int, _Camera]:
     cameras = {}
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
-        name, parameters = _MODELS.get(model, (f"number {model}", ()))
+        name, parameters = _MODELS.get(model, (_OTHER_MODELS.get(model, f"number {model}"), ()))
         values = struct.unpack_from(f"<{len(parameters)}d", data, at + 24)
         cameras[number] = _camera(name, width, height, list(values), path)
         at += 24 + 8 * len(parameters)
