@@ -132,7 +132,7 @@ def _run(verb: str, name: str, rest: list[str]) -> int:
         args=rest,
         config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
     )
-    _check_ranges(parsed)
+    _check_values(parsed)
     return module.run(replace(parsed, settings=tuple(settings)) if settings else parsed)
 
 
@@ -169,13 +169,25 @@ def _with_axes(arguments: list[str]) -> list[str]:
     return joined
 
 
-def _check_ranges(parsed: Any) -> None:
-    """Refuse whole numbers outside the range that a verb declares, because the parser does not check it."""
+def _check_values(parsed: Any) -> None:
+    """Refuse numbers outside the range and paths without the file that a verb declares.
+
+    The parser checks neither, and the verb would import torch first.
+
+    Raises:
+        ValueError: such a value.
+    """
+    from hyperplanes.commands.options import Exists
+
     for name, hint in get_type_hints(type(parsed), include_extras=True).items():
-        allowed = next((note for note in getattr(hint, "__metadata__", ()) if isinstance(note, range)), None)
-        if allowed is not None and getattr(parsed, name) not in allowed:
-            expected = f"a whole number from {allowed[0]} to {allowed[-1]}"
-            raise ValueError(f"--{name.replace('_', '-')}: expected {expected}, got {getattr(parsed, name)}")
+        value = getattr(parsed, name)
+        for note in getattr(hint, "__metadata__", ()):
+            if isinstance(note, range) and value not in note:
+                expected = f"a whole number from {note[0]} to {note[-1]}"
+                raise ValueError(f"--{name.replace('_', '-')}: expected {expected}, got {value}")
+            if isinstance(note, Exists) and value is not None:
+                for path in value if isinstance(value, tuple) else [value]:
+                    note.check(path)
 
 
 def _names_of_other_packages(module: ModuleType) -> list[str]:

@@ -38,7 +38,7 @@ from hyperplanes.commands.output.console import Console
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.data import DataError, open_dataset, read_task
-from hyperplanes.data.dataset import locate_scene
+from hyperplanes.data.packaged import locate_scene
 from hyperplanes.data.support import FewerQueries, Inputs, WithSupport
 from hyperplanes.evaluation import evaluate, suitability
 from hyperplanes.export.baking import BakedScene
@@ -104,6 +104,11 @@ def compiled(monkeypatch):
     monkeypatch.setattr("hyperplanes.experiments.demonstration.steps.compile_kernels", lambda device: None)
 
 
+def refuse_to_find_a_renderer(monkeypatch):
+    """Fail if a command looks for a renderer."""
+    monkeypatch.setattr("data_gen.rendering.renderers.find_renderer", lambda _: pytest.fail("looked for a renderer"))
+
+
 def test_help_loads_nothing_heavy():
     script = (
         "import sys; from hyperplanes.cli import main; main(['--help']); "
@@ -157,6 +162,69 @@ for verb in sys.argv[1:]:
             assert "or a packaged model: small, small-paper, cars-64" in text
 
 
+WRONG_PATHS = {
+    "evaluate --data none": "the folder of a data set, found nothing; check the path, or run hyperplanes generate",
+    "evaluate --data example-car --lpips none": "a safetensors file of weights of LPIPS, found nothing",
+    "train --data example-car none --out out": "the folder of a data set, found nothing; check the path, or run hyper",
+    "train --data example-car --config none --out out": "a YAML file of settings, found nothing; check the path",
+    **{
+        f"{line} --checkpoint small": "a transforms*.json or the folder of a scene, found nothing; check the path"
+        for line in (
+            *("render --views none --out out", "export --views none --out out", "bake --views none --out out"),
+            *("adapt --views none --out out", "view none"),
+        )
+    },
+    "render --checkpoint small --views example-car --out out --camera-path none": "a JSON file with a camera path",
+    "render --checkpoint small --views example-car --out out --dataparser-transforms none": "nerfstudio's dataparser_",
+    "capture none --out out": "a folder of photographs, or a video, found nothing; check the path",
+    "demo --meshes none --out out": "a folder of mesh files, found nothing; check the path",
+    "generate --meshes none --out out": "a folder of meshes, found nothing; give the folder",
+    "generate --meshes . --split-file none --out out": "ShapeNet's official all.csv, found nothing; check the path",
+}
+"""Command lines with the path `none`, at which nothing exists, and what is expected there."""
+
+
+def test_a_wrong_path_is_refused_in_one_line_before_torch_is_imported(tmp_path):
+    script = (
+        "import sys; from hyperplanes.cli import main\n"
+        "for line in sys.argv[1:]: print(main(line.split()), sorted({'torch', 'kornia', 'OpenGL'} & set(sys.modules)))"
+    )
+    command = [sys.executable, "-c", script, *WRONG_PATHS]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path, env=environment)
+    assert done.stdout.splitlines() == ["2 []"] * len(WRONG_PATHS)
+    for (line, expected), error in zip(WRONG_PATHS.items(), done.stderr.splitlines(), strict=True):
+        assert error.startswith(f"hyperplanes {line.split()[0]}: none: expected {expected}")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "evaluate --data example-car",
+        "train --data example-car --out out",
+        "render --checkpoint small --views example-car --out out",
+        "view example-car",
+    ],
+)
+def test_the_name_of_a_packaged_scene_is_a_path_that_exists(line, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runs = []
+    monkeypatch.setattr(f"hyperplanes.commands.{line.split()[0]}.run", lambda arguments: runs.append(arguments) or 0)
+    assert main(line.split()) == 0
+    assert len(runs) == 1
+
+
+def test_a_path_with_a_file_or_a_link_to_nothing_says_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    refuse_to_find_a_renderer(monkeypatch)
+    Path("file").touch()
+    Path("link").symlink_to("none")
+    for path, found in (("file", "a file"), ("link", "a link to nothing"), ("example-car", "nothing")):
+        assert main(["generate", "--meshes", path, "--out", "out"]) == 2
+        assert error_line(capsys).endswith(f": {path}: expected a folder of meshes, found {found}; give the folder")
+
+
 def test_an_unknown_verb_is_answered_with_a_suggestion(capsys):
     assert main(["trian"]) == 2
     assert "did you mean train?" in error_line(capsys)
@@ -190,15 +258,18 @@ def test_version(capsys):
     assert capsys.readouterr().out.startswith("hyperplanes 0")
 
 
-RENDER = ["render", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", "--out", "OUT/run"]
-BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", "--out"]
+RENDER = ["render", "--checkpoint", "OUT/not-looked-at", "--views", "OUT", "--out", "OUT/run"]  # OUT has no views
+BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT", "--out"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
         (["generate", "--out", "OUT"], ["--class", "--meshes"]),
-        (["generate", "--meshes", "OUT/none", "--out", "OUT"], ["OUT/none", "found nothing"]),
+        (
+            ["generate", "--meshes", "OUT/none", "--out", "OUT"],
+            ["OUT/none: expected a folder of meshes, found nothing"],
+        ),
         (["generate", "--class", "caar", "--out", "OUT"], ["class: expected one of car, chair", "did you mean car?"]),
         (
             ["generate", "--class", "car", "--layout", "srm", "--out", "OUT"],
@@ -207,7 +278,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         (["generate", "--class", "car", "--rig", "orbits", "--out", "OUT"], ["expected one of fixed", "mean orbit?"]),
         (["reproduce", "targets", "--out", "OUT"], ["expected one of shapenet, ", "did you mean target?"]),
         (["generate", "--class", "car", "--count", "0", "--out", "OUT"], ["at least 1 object", "0"]),
-        (["generate", "--class", "car", "--split-file", "all.csv", "--out", "OUT"], ["split_file", "--meshes"]),
+        (["generate", "--class", "car", "--split-file", "OUT", "--out", "OUT"], ["split_file", "--meshes"]),
         (["train", "--data", "OUT/none", "--out", "OUT/run"], ["OUT/none", "hyperplanes generate"]),
         (["train", "--data", "DATA", "--preset", "huge", "--out", "OUT/run"], ["quick", "huge"]),
         (["train", "--data", "DATA", "--field", "voxels", "--out", "OUT/run"], ["image_based", "voxels"]),
@@ -271,7 +342,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         (["inspect", "smal"], ["smal: expected a data set, posed images", "small-paper, cars-64, example"]),
         (
             ["demo", "--first-only", "--meshes", "OUT/none", "--out", "OUT/demo"],
-            ["--meshes: expected a folder of mesh files, got OUT/none, which is nothing"],
+            ["OUT/none: expected a folder of mesh files, found nothing; check the path"],
         ),
         ([*RENDER, "--orbit", "0"], ["--orbit: expected 1 to 10000 frames, got 0"]),
         ([*RENDER, "--orbit", "100000000"], ["--orbit: expected 1 to 10000 frames, got 100000000"]),
@@ -337,10 +408,10 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT/nor-this", 
         (["export", *RENDER[1:], "--texture", "-1"], ["--texture: expected a whole number from 16 to 8192, got -1"]),
         (["export", *RENDER[1:], "--what", "points", "--points", "0"], ["--points: expected a whole number from 1 to"]),
         (
-            [*RENDER, "--orbit", "2", "--camera-path", "OUT/a"],
+            [*RENDER, "--orbit", "2", "--camera-path", "OUT"],
             ["--camera-path, --orbit: expected one of them, got both"],
         ),
-        ([*RENDER, "--dataparser-transforms", "OUT/a"], ["--dataparser-transforms: expected --camera-path"]),
+        ([*RENDER, "--dataparser-transforms", "OUT"], ["--dataparser-transforms: expected --camera-path"]),
         ([*BAKE, "OUT/bk.safetensors", "--orbit", "0"], ["--orbit: expected 1 to 10000 frames, got 0"]),
         (["export", *RENDER[1:], "--size", "0"], ["--size: expected at least 1 pixel, got 0"]),
         (["export", *RENDER[1:], "--what", "mesh", "--size", "64"], ["--size: expected --what turntable as well, got"]),
@@ -415,6 +486,29 @@ def test_pictures_do_not_overwrite_the_images_that_are_read(verb, out, more, tmp
     assert main(arguments) == 2
     assert "--out: expected a folder that no images or poses are read from, got photos/images" in error_line(capsys)
     assert {path: path.read_bytes() for path in (tmp_path / "photos").rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("--class car --rig orbits", "rig: expected one of"),
+        ("--class car --layout srm", "layout: expected one of"),
+        ("--class car --layout srn --distance 9", "distance: expected "),
+        ("--class car --count 0", "count, seed: expected at least 1 object"),
+        ("--class car --count 3 --held-out 4", "held_out: expected"),
+        ("--class car --resolution 0", "resolution: expected at least 1 pixel"),
+        ("--meshes . --class-name a/b", "class_name: expected letters"),
+        ("--meshes none", "none: expected a folder of meshes"),
+    ],
+)
+def test_what_generate_refuses_by_name_or_number_needs_no_renderer(line, expected, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    refuse_to_find_a_renderer(monkeypatch)
+    assert main(["generate", *line.split(), "--out", "out"]) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith(f"hyperplanes generate: {expected}")
+    assert shown.err.count("\n") == 1
 
 
 def test_a_traceback_is_shown_when_asked_for():

@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from data_gen import SUPERSAMPLE
-from hyperplanes.commands.options import OptionalFolder, OptionalInt, OptionalName, OptionalNumber, optional
+from hyperplanes.commands.options import (
+    Exists,
+    OptionalFile,
+    OptionalFolder,
+    OptionalInt,
+    OptionalName,
+    OptionalNumber,
+    optional,
+)
 from hyperplanes.commands.output.console import Console
 from hyperplanes.utilities.messages.formatting import format_duration
 
@@ -72,7 +80,7 @@ class Arguments:
 
     out: Path
     class_name: Annotated[str | None, optional("NAME", name="class")] = None
-    meshes: OptionalFolder = None
+    meshes: Annotated[OptionalFolder, Exists("a folder of meshes", "give the folder", folder=True)] = None
     meshes_class: Annotated[str | None, optional("NAME", name="class-name")] = None
     count: OptionalInt = None
     seed: int = 0
@@ -88,7 +96,7 @@ class Arguments:
     layout: Annotated[str, tyro.conf.arg(metavar="{native,srn,learnit-128,hyperplanes-200}")] = "native"
     up: Literal["y", "z"] = "y"
     up_of: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[PATTERN=AXIS [...]]")] = ()
-    split_file: Annotated[Path | None, optional("FILE")] = None
+    split_file: Annotated[OptionalFile, Exists("ShapeNet's official all.csv")] = None
     channels: tuple[Literal["rgba", "depth", "normals", "coordinates", "mesh"], ...] = ("rgba",)
     workers: OptionalInt = None
     engine: Literal["local", "ray"] = "local"
@@ -175,19 +183,21 @@ def _some(names: list[str]) -> str:
 
 def run(arguments: Arguments) -> int:
     """Generate the data set and say what was skipped."""
-    from data_gen.datasets.generate import GenerationConfig, generate
+    from data_gen.datasets.generate import GenerationConfig, check, generate
     from data_gen.datasets.manifest import verify
     from data_gen.rendering.renderers import find_renderer
 
     console = Console()
     source = source_of(arguments)
+    names = {field.name for field in fields(GenerationConfig)} & {field.name for field in fields(Arguments)}
+    given: dict[str, Any] = {name: getattr(arguments, name) for name in names}
+    config = GenerationConfig(**given)
+    check(source, config)  # first, because it takes seconds to find a renderer
     renderer = find_renderer(arguments.renderer)
     console.say(f"renderer: {renderer.name} ({renderer.detail})")
     for line in renderer.advice:
         console.say(f"a faster one: {line}")
-    names = {field.name for field in fields(GenerationConfig)} & {field.name for field in fields(Arguments)}
-    given: dict[str, Any] = {name: getattr(arguments, name) for name in names}
-    config = replace(GenerationConfig(**given), renderer=renderer.name)
+    config = replace(config, renderer=renderer.name)
     with console.bar("rendering") as bar:
         report = generate(source, arguments.out, config, progress=bar.show)
     for name, reason in report.skipped:

@@ -157,7 +157,7 @@ def _inspect(arguments: Arguments, console: Console) -> int:
         return 0
     from data_gen.datasets.inspect import inspect
     from hyperplanes.commands.inputs.scene import refuse_sources
-    from hyperplanes.data.dataset import locate_scene
+    from hyperplanes.data.packaged import locate_scene
     from hyperplanes.utilities.files.reading import DataError
 
     if not locate_scene(arguments.path).exists():

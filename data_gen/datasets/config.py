@@ -73,13 +73,20 @@ class GenerationConfig:
 
         Returns:
             A configuration in which all that affects pictures has a value, except for a field of view of None, with
-            which the object just fits, and a distance of None, which depends on the layout and the class.
+            which the object just fits, and a distance of None, which depends on the layout and the class. An
+            unknown name, a number that makes no sense, or no renderer that works is a ValueError.
+        """
+        from data_gen.rendering.renderers import find_renderer
+
+        return replace(self.resolve_except_renderer(), renderer=find_renderer(self.renderer).name)
+
+    def resolve_except_renderer(self) -> GenerationConfig:
+        """As `resolve`, but the renderer, which takes seconds to find, stays as it is and is not checked.
 
         Raises:
-            ValueError: if a name is unknown, a number makes no sense, or no renderer works.
+            ValueError: if a name is unknown, or a number makes no sense.
         """
         from data_gen.rendering.mesh_renderer import MAX_SUPERSAMPLE
-        from data_gen.rendering.renderers import find_renderer
 
         self._check_names()
         layout, preset = LAYOUTS[self.layout], RIG_PRESETS.get(self.rig)
@@ -120,7 +127,7 @@ class GenerationConfig:
             channels=channels,
         )
         config.make_rig("")  # invalid numbers raise here, not in every worker
-        return replace(config, renderer=find_renderer(self.renderer).name)
+        return config
 
     def make_rig(self, name: str, class_name: str | None = None) -> Rig:
         """The cameras of an object, for a resolved configuration.

@@ -13,19 +13,16 @@ from typing import Any
 from data_gen.datasets.config import GenerationConfig
 from data_gen.datasets.layouts import LAYOUTS, check_names
 from data_gen.datasets.manifest import Entry, GenerationState, build_manifest, holds_data_set
-from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, list_items
+from data_gen.datasets.sources import Item, MeshFolder, Procedural, Source, check_source, list_items
 from data_gen.datasets.workers import Outcome, WorkerError, run_isolated
 from data_gen.rigs import OBJECT_RADIUS
 from hyperplanes.utilities.files.reading import DataError
 from hyperplanes.utilities.machine.environment import usable_cores
 
-__all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "generate"]
+__all__ = ["GenerationConfig", "GenerationReport", "MeshFolder", "Procedural", "check", "generate"]
 
 PICTURES = 5
 """Version of the pictures, increased whenever the same arguments give other bytes, so that none are mixed."""
-
-MOST_OBJECTS = 1_000_000
-"""Most objects of a data set; a larger manifest could not be read."""
 
 TARGET = "data_gen.datasets.objects:open_renderer"
 
@@ -63,6 +60,21 @@ class GenerationReport:
     duplicates: list[str]
 
 
+def check(source: Source, config: GenerationConfig) -> None:
+    """Refuse names and numbers that are wrong whatever the files and the renderer are, which take longer to find.
+
+    An unknown name, or a number that makes no sense, is a ValueError.
+
+    Args:
+        source: as in `generate`.
+        config: as in `generate`.
+    """
+    check_source(source, config.held_out)
+    render = config.resolve_except_renderer()
+    if isinstance(source, Procedural):
+        render.check_class(source.class_name)
+
+
 def generate(
     source: Source,
     out: str | Path,
@@ -92,8 +104,7 @@ def generate(
     """
     begun = time.monotonic()
     out, config = Path(out), config or GenerationConfig()
-    if isinstance(source, Procedural) and source.count > MOST_OBJECTS:
-        raise ValueError(f"count: expected at most {MOST_OBJECTS} objects, got {source.count}; make several data sets")
+    check(source, config)
     render = config.resolve()
 
     def reason_against(folder: Path) -> str | None:

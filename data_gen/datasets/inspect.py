@@ -67,10 +67,10 @@ def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS, *, check
         The description and the files. A data set that cannot be opened is a DataError.
     """
     from hyperplanes.data import open_dataset
-    from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.inspection.describe import describe
     from hyperplanes.data.inspection.picture import draw_coverage
     from hyperplanes.data.inspection.scene import describe_scene
+    from hyperplanes.data.packaged import locate_scene
 
     data, out = open_dataset(path), Path(out)
     description = describe(data, objects)

@@ -15,7 +15,10 @@ import numpy as np
 
 from data_gen.meshes.files import STATES_ITS_AXIS
 
-__all__ = ["Item", "Listing", "MeshFolder", "Procedural", "Source", "list_items", "seed_of"]
+__all__ = ["Item", "Listing", "MeshFolder", "Procedural", "Source", "check_source", "list_items", "seed_of"]
+
+MOST_OBJECTS = 1_000_000
+"""Most objects of a data set; a larger manifest could not be read."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,21 @@ class Listing:
     duplicates: list[tuple[str, str]] = field(default_factory=list)
 
 
+def check_source(source: Source, held_out: float | int | None) -> None:
+    """Refuse a source for what it states, without looking for its files.
+
+    An unknown class or axis, or a number that makes no sense, is a ValueError.
+
+    Args:
+        source: what would be listed.
+        held_out: as in `list_items`.
+    """
+    if isinstance(source, Procedural):
+        _check_procedural(source, held_out)
+    else:
+        _check_meshes(source, held_out)
+
+
 def list_items(
     source: Source,
     held_out: float | int | None,
@@ -116,6 +134,7 @@ def list_items(
     Returns:
         The objects. An unknown class or an invalid count is a ValueError.
     """
+    check_source(source, held_out)
     procedural = isinstance(source, Procedural)
     listing = Listing(_procedural(source, held_out)) if procedural else _meshes(source, held_out, reason_against)
     order = {"train": 0, "val": 1, "test": 2}
@@ -132,7 +151,7 @@ def seed_of(seed: int, *parts: object) -> int:
     return int.from_bytes(digest[:8], "big") >> 1
 
 
-def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
+def _check_procedural(source: Procedural, held_out: float | int | None) -> None:
     from data_gen.shapes import check_class
 
     check_class(source.class_name)
@@ -140,7 +159,17 @@ def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
         raise ValueError(
             f"count, seed: expected at least 1 object and a seed >= 0, got {source.count} and {source.seed}"
         )
-    kept = _held_out(source.count, 1 / 7 if held_out is None else held_out)
+    if source.count > MOST_OBJECTS:
+        raise ValueError(f"count: expected at most {MOST_OBJECTS} objects, got {source.count}; make several data sets")
+    _count_held_out(source, held_out)
+
+
+def _count_held_out(source: Procedural, held_out: float | int | None) -> int:
+    return _held_out(source.count, 1 / 7 if held_out is None else held_out)
+
+
+def _procedural(source: Procedural, held_out: float | int | None) -> list[Item]:
+    kept = _count_held_out(source, held_out)
     totals, taken, items = {"train": source.count - kept, "test": kept}, set(), []
     for index in range(max(totals.values())):
         for split, infix in (("train", ""), ("test", "test_")):
@@ -162,8 +191,8 @@ def _draw(sequence: np.random.SeedSequence, taken: set[int]) -> int:
     return seed
 
 
-def _meshes(source: MeshFolder, held_out: float | int | None, reason_against: Callable[[Path], str | None]) -> Listing:
-    from data_gen.meshes.find import find_meshes, safe_name
+def _check_meshes(source: MeshFolder, held_out: float | int | None) -> None:
+    from data_gen.meshes.find import safe_name
 
     if source.up not in ("y", "z"):
         raise ValueError(f"up: expected y or z, got {source.up!r}")
@@ -171,6 +200,11 @@ def _meshes(source: MeshFolder, held_out: float | int | None, reason_against: Ca
         raise ValueError(f"class_name: expected letters, digits, . - and _, got {source.class_name!r}")
     if source.split_file is not None and held_out is not None:
         raise ValueError(f"held_out: expected none, for {source.split_file} decides, got {held_out}")
+
+
+def _meshes(source: MeshFolder, held_out: float | int | None, reason_against: Callable[[Path], str | None]) -> Listing:
+    from data_gen.meshes.find import find_meshes
+
     found = find_meshes(source.path, split_file=source.split_file, reason_against=reason_against)
     if source.split_file is not None and not any(mesh.split for mesh in found.meshes):
         raise ValueError(f"{source.split_file}: expected models of {source.path}, found none of them; check both")

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from hyperplanes.commands.options import Exists
 from hyperplanes.commands.output.console import Console
 from hyperplanes.commands.output.writing import writes_to
 from hyperplanes.utilities.messages.formatting import format_duration
@@ -46,7 +47,7 @@ class Arguments:
         frames: Frames that are taken from a video.
     """
 
-    photographs: tyro.conf.Positional[Path]
+    photographs: Annotated[tyro.conf.Positional[Path], Exists("a folder of photographs, or a video")]
     out: Path
     mask: Annotated[str, tyro.conf.arg(metavar="{auto,given,colour,network,grabcut,none,COMMAND}")] = "auto"
     size: Annotated[int, range(64, 1 << 16)] = 1000

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from hyperplanes.commands.options import OptionalFolder, OptionalInt
+from hyperplanes.commands.options import Exists, OptionalFolder, OptionalInt
 from hyperplanes.commands.output.console import Console
 from hyperplanes.commands.output.writing import writes_to
 from hyperplanes.commands.runs import count_workers, make_runner, make_workers
@@ -64,7 +64,7 @@ class Arguments:
     resolution: int = 64
     preset: str = "quick"
     steps: Annotated[int, range(1, 10**10)] = 800
-    meshes: OptionalFolder = None
+    meshes: Annotated[OptionalFolder, Exists("a folder of mesh files", folder=True)] = None
     first_only: bool = False
     seed: int = 0
     workers: OptionalInt = None
@@ -76,15 +76,11 @@ def settings_of(arguments: Arguments) -> DemoSettings:
     """The settings of the demonstration.
 
     Raises:
-        ValueError: too few objects or pixels, or no folder of meshes.
+        ValueError: too few objects or pixels, or options that --quick-check sets.
     """
     from hyperplanes.configuration.presets import preset
     from hyperplanes.experiments.demonstration.settings import DemoSettings
 
-    if arguments.meshes is not None and not arguments.meshes.is_dir():
-        found = "a file" if arguments.meshes.exists() else "nothing"
-        what = f"got {arguments.meshes}, which is {found}"
-        raise ValueError(f"--meshes: expected a folder of mesh files, {what}; check the path")
     if arguments.quick_check:
         usual = Arguments()
         for name in ("objects", "held_out", "resolution", "preset", "steps"):

@@ -33,7 +33,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from hyperplanes.commands.options import Free, OptionalInt, Protocol, ViewsUp, check_fine_tune, optional
+from hyperplanes.commands.options import (
+    DATA_SET,
+    Exists,
+    Free,
+    OptionalFile,
+    OptionalInt,
+    Protocol,
+    ViewsUp,
+    check_fine_tune,
+    optional,
+)
 from hyperplanes.commands.output.console import Console
 from hyperplanes.commands.output.writing import check_output
 from hyperplanes.utilities.messages.formatting import counted
@@ -96,7 +106,7 @@ class Arguments:
         device: auto, cpu or cuda.
     """
 
-    data: Path
+    data: Annotated[Path, DATA_SET]
     method: tuple[str, ...] = ("nearest_view", "hyperplanes")
     checkpoint: tuple[Path, ...] = ()
     json: Annotated[Path | None, optional("FILE")] = None
@@ -108,7 +118,7 @@ class Arguments:
     curve: Annotated[Path | None, optional("FILE")] = None
     fine_tune: Free = "weights"
     seeds: int = 1
-    lpips: Annotated[Path | None, optional("FILE")] = None
+    lpips: Annotated[OptionalFile, Exists("a safetensors file of weights of LPIPS")] = None
     split: Literal["test", "val", "train", "all"] = "test"
     objects: OptionalInt = None
     support: OptionalInt = None

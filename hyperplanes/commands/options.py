@@ -8,7 +8,13 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from hyperplanes.data.packaged import locate_scene
+from hyperplanes.utilities.files.reading import DataError
+
 __all__ = [
+    "DATA_SET",
+    "POSED_IMAGES",
+    "Exists",
     "Free",
     "ObjectArguments",
     "OptionalFile",
@@ -30,6 +36,46 @@ def optional(metavar: str, **options: Any) -> Any:
     """The annotation for tyro of an option with the default None: the help shows no {None} and no (default: None)."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="", **options)
 
+
+@dataclass(frozen=True)
+class Exists:
+    """Marks an option, `Annotated[Path, Exists(...)]`, with one or more paths at which something must exist.
+
+    The command line checks it before it runs a verb, so that a wrong path is refused before torch is imported.
+
+    Attributes:
+        expected: What is expected at the path, for the error.
+        remedy: What to do if it is not there.
+        folder: Whether it must be a folder.
+        packaged: Whether the name of a scene that comes with the package is a path too.
+    """
+
+    expected: str
+    remedy: str = "check the path"
+    folder: bool = False
+    packaged: bool = False
+
+    def check(self, path: Path) -> None:
+        """Refuse a path.
+
+        Args:
+            path: the value of the option, or one of its values.
+
+        Raises:
+            DataError: nothing exists at the path, or a file where a folder is expected.
+        """
+        place = locate_scene(path) if self.packaged else path
+        if place.is_dir() or (place.exists() and not self.folder):
+            return
+        missing = "a link to nothing" if place.is_symlink() else "nothing"
+        raise DataError(path, self.expected, "a file" if place.exists() else missing, self.remedy)
+
+
+DATA_SET = Exists("the folder of a data set", "check the path, or run hyperplanes generate", packaged=True)
+"""Marks a data set, or one posed scene."""
+
+POSED_IMAGES = Exists("a transforms*.json or the folder of a scene", packaged=True)
+"""Marks the posed images of one scene."""
 
 OptionalFolder = Annotated[Path | None, optional("FOLDER")]
 OptionalFile = Annotated[Path | None, optional("FILE")]
@@ -95,7 +141,7 @@ class ObjectArguments(ViewsArguments):
     """
 
     checkpoint: Path
-    views: Path
+    views: Annotated[Path, POSED_IMAGES]
     out: Path
     steps: Steps = 0
     all_views: bool = False

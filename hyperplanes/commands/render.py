@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from hyperplanes.commands.inputs.fields import adapt_to, bake_field, load_source, refuse_of_baked, render_views
 from hyperplanes.commands.inputs.scene import read_object, read_path, refuse_sources
 from hyperplanes.commands.options import (
+    Exists,
     Free,
     ObjectArguments,
     OptionalFile,
@@ -78,8 +79,8 @@ class Arguments(ObjectArguments):
 
     fine_tune: Free = "weights"
     orbit: Annotated[int | None, optional("FRAMES")] = None
-    camera_path: OptionalFile = None
-    dataparser_transforms: OptionalFile = None
+    camera_path: Annotated[OptionalFile, Exists("a JSON file with a camera path")] = None
+    dataparser_transforms: Annotated[OptionalFile, Exists("nerfstudio's dataparser_transforms.json")] = None
     rendered_output_names: tuple[Literal["rgb", "depth", "normals", "accumulation"], ...] = ("rgb",)
     size: OptionalInt = None
     turntable: Literal["webp", "gif", "mp4", "webm"] = "webp"

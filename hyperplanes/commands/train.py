@@ -33,12 +33,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from hyperplanes.commands.options import (
+    DATA_SET,
+    Exists,
+    OptionalFile,
     OptionalFolder,
     OptionalInt,
     OptionalName,
     OptionalNumber,
     Protocol,
-    optional,
 )
 from hyperplanes.commands.output.console import Bar, Console
 from hyperplanes.commands.output.writing import writes_to
@@ -102,9 +104,9 @@ class Arguments:
             MASTER_PORT and NODE_RANK in its environment. All of them must have access to the folder --out.
     """
 
-    data: tuple[Path, ...]
+    data: Annotated[tuple[Path, ...], DATA_SET]
     out: Path
-    config: Annotated[Path | None, optional("FILE")] = None
+    config: Annotated[OptionalFile, Exists("a YAML file of settings")] = None
     preset: OptionalName = None
     method: OptionalName = None
     field: OptionalName = None

@@ -29,7 +29,7 @@ import tyro
 
 from hyperplanes.commands.inputs.fields import bake_field, load_source, refuse_of_baked
 from hyperplanes.commands.inputs.scene import prepare_task, read_scene
-from hyperplanes.commands.options import ViewsArguments
+from hyperplanes.commands.options import POSED_IMAGES, ViewsArguments
 from hyperplanes.commands.output.console import Console
 from hyperplanes.utilities.machine.interrupts import Terminated
 from hyperplanes.utilities.messages.formatting import counted
@@ -62,7 +62,7 @@ class Arguments(ViewsArguments):
         port: The port of the page on this machine.
     """
 
-    views: tyro.conf.Positional[Path]
+    views: Annotated[tyro.conf.Positional[Path], POSED_IMAGES]
     checkpoint: Path = Path("small")
     steps: Annotated[int, range(100_000)] = 0
     fit: Annotated[int, range(10_000)] = 100

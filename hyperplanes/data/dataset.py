@@ -11,6 +11,7 @@ from typing import Any
 
 from hyperplanes.data.formats.catalogue import SPLITS
 from hyperplanes.data.formats.recognise import find_catalogue, read_posed, read_posed_task
+from hyperplanes.data.packaged import locate_scene
 from hyperplanes.data.pictures.posed import PosedTask
 from hyperplanes.data.upright import guess_up, upright, upright_task
 from hyperplanes.geometry import cameras as camera
@@ -19,10 +20,9 @@ from hyperplanes.utilities.messages.arguments import checked
 from hyperplanes.utilities.tensors.lru_cache import LRUCache
 from hyperplanes.views import Task, Views
 
-__all__ = ["Dataset", "Datasets", "locate_scene", "open_dataset", "open_datasets", "read_task", "read_views"]
+__all__ = ["Dataset", "Datasets", "open_dataset", "open_datasets", "read_task", "read_views"]
 
 DEFAULT_BUDGET = 2 * 2**30
-EXAMPLES = Path(__file__).parent.parent / "examples"  # one folder per packaged scene
 
 
 class Dataset:
@@ -252,17 +252,6 @@ def read_views(path: str | Path, downscale: int | None = None, *, up: str | None
         views = scene.views()
     warn_of(scene.notes, path)
     return views if up is None else upright(views, _up_of(up, views))
-
-
-def locate_scene(path: str | Path) -> Path:
-    """The path; for a bare name at which nothing exists, the path of the packaged scene of that name, if there is one.
-
-    Args:
-        path: of posed images, or the name of a packaged scene such as "example-car".
-    """
-    path = Path(path)
-    packaged = EXAMPLES / path.name
-    return packaged if len(path.parts) == 1 and not path.exists() and packaged.is_dir() else path
 
 
 @checked

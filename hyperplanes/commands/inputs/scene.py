@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hyperplanes.data.packaged import locate_scene
+
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
@@ -86,7 +88,6 @@ def read_scene(
     Returns:
         The task in a world with y up, and the direction that was up before.
     """
-    from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.formats.recognise import read_posed, read_posed_task, scene_name
     from hyperplanes.data.upright import upright_task
     from hyperplanes.utilities.files.reading import malformed
@@ -125,7 +126,6 @@ def read_path(
         console: prints messages.
     """
     from hyperplanes.data.camera_path import read_camera_path
-    from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.formats.recognise import read_posed
     from hyperplanes.data.upright import upright_cameras
     from hyperplanes.geometry import cameras as camera
@@ -218,7 +218,6 @@ def refuse_sources(folder: Path, path: Path, task: Task | None = None) -> None:
     Raises:
         ValueError: the folder contains images of `task`, or has the name of a folder from which a scene is read.
     """
-    from hyperplanes.data.dataset import locate_scene
     from hyperplanes.data.formats.recognise import is_scene
 
     path = locate_scene(path)

@@ -16,7 +16,8 @@ from hyperplanes.adaptation.checkpoints import find_checkpoint, packaged_folder
 from hyperplanes.adaptation.correction.held_out import FEWEST
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.data.dataset import EXAMPLES, read_task
+from hyperplanes.data.dataset import read_task
+from hyperplanes.data.packaged import EXAMPLES
 from hyperplanes.data.support import Shown
 from hyperplanes.evaluation import Score
 from hyperplanes.experiments.demonstration.settings import (
