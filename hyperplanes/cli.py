@@ -182,7 +182,7 @@ def _check_values(parsed: Any) -> None:
     for name, hint in get_type_hints(type(parsed), include_extras=True).items():
         value = getattr(parsed, name)
         for note in getattr(hint, "__metadata__", ()):
-            if isinstance(note, range) and value not in note:
+            if isinstance(note, range) and value is not None and value not in note:
                 expected = f"a whole number from {note[0]} to {note[-1]}"
                 raise ValueError(f"--{name.replace('_', '-')}: expected {expected}, got {value}")
             if isinstance(note, Exists) and value is not None:

@@ -326,6 +326,7 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT", "--out"]
             ["evaluate", "--data", "DATA", "--method", "nearest_view", "--preset", "huge"],
             ["preset: expected one of", "huge"],
         ),
+        (["capture", "OUT", "--frames", "5", "--out", "OUT/scene"], ["--frames: expected a video, got the folder"]),
         (["inspect", "small", "--checksums"], ["--checksums: expected a data set, got small"]),
         (["evaluate", "--data", "DATA", "--method", "nearest_view", "--boxes", "OUT/a.gfi"], ["OUT/a.gfi", "png"]),
         (["evaluate", "--data", "DATA", "--method", "hyperplanes"], ["checkpoint", "hyperplanes train"]),

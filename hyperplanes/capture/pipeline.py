@@ -54,6 +54,9 @@ ADVICE = (
     "such as a newspaper under it"
 )
 
+FRAMES = 60
+"""Frames that are taken from a video."""
+
 
 @checked_fields
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ class Settings:
 
     max_size: Annotated[int, range(64, 1 << 16)] = 1000
     mask: str = "auto"
-    frames: Annotated[int, range(3, 1 << 16)] = 60
+    frames: Annotated[int, range(3, 1 << 16)] = FRAMES
     order: Literal["auto", "sequence", "any"] = "auto"
 
 

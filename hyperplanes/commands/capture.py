@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from hyperplanes.commands.options import Exists
+from hyperplanes.commands.options import Exists, OptionalInt
 from hyperplanes.commands.output.console import Console
 from hyperplanes.commands.output.writing import writes_to
 from hyperplanes.utilities.messages.formatting import format_duration
@@ -44,7 +44,7 @@ class Arguments:
         size: Most pixels along the longer side of the images.
         order: Which photographs are matched. sequence: neighbours, as in a video. any: all pairs. auto: neighbours for
             a video and for many photographs, otherwise all pairs.
-        frames: Frames that are taken from a video.
+        frames: Frames that are taken from a video, 60 if not given.
     """
 
     photographs: Annotated[tyro.conf.Positional[Path], Exists("a folder of photographs, or a video")]
@@ -52,16 +52,19 @@ class Arguments:
     mask: Annotated[str, tyro.conf.arg(metavar="{auto,given,colour,network,grabcut,none,COMMAND}")] = "auto"
     size: Annotated[int, range(64, 1 << 16)] = 1000
     order: Literal["auto", "sequence", "any"] = "auto"
-    frames: Annotated[int, range(3, 1 << 16)] = 60
+    frames: Annotated[OptionalInt, range(3, 1 << 16)] = None
 
 
 @writes_to(lambda arguments: arguments.out)
 def run(arguments: Arguments) -> int:
     """Find poses and masks, write the scene, and print what was found and what was left out."""
     from hyperplanes.capture import Settings, capture
+    from hyperplanes.capture.pipeline import FRAMES
 
     console, started = Console(), time.perf_counter()
-    settings = Settings(arguments.size, arguments.mask, arguments.frames, arguments.order)
+    if arguments.frames is not None and arguments.photographs.is_dir():
+        raise ValueError(f"--frames: expected a video, got the folder {arguments.photographs}, of which all are used")
+    settings = Settings(arguments.size, arguments.mask, arguments.frames or FRAMES, arguments.order)
     with ExitStack() as stack:
         shown: tuple[str, Bar] | None = None
 

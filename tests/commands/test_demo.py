@@ -15,7 +15,7 @@ from hyperplanes.experiments.demonstration.settings import DemoSettings
     "settings",
     [
         DemoSettings(),
-        DemoSettings(class_name="chair", objects=9, held_out=3, resolution=32, preset="fast", steps=7, seed=2),
+        DemoSettings(class_name="chair", objects=9, held_out=3, resolution=32, preset="small", steps=7, seed=2),
         DemoSettings.quick_check(),
         replace(DemoSettings.quick_check(3), class_name="lamp", meshes=Path("tests/my meshes")),
     ],
