@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -44,8 +45,8 @@ def start_training(
         data: tasks with a "train" split.
         folder: the folder for checkpoints.
         device: the device to train on.
-        reference: the checkpoint whose weights a new training begins with; for mv_matched, the checkpoint of mv_meta
-            that is matched.
+        reference: the checkpoint whose weights a new training begins with, and whose learned steps and gating network
+            the model keeps as they are; for mv_matched, the checkpoint of mv_meta that is matched.
 
     Returns:
         A trainer; its `step` is the number of steps done. CheckpointError if the folder has another model or training.
@@ -53,6 +54,8 @@ def start_training(
         with, or if there are fewer support views than planes.
     """
     matching = config.initialisation is not None and config.initialisation.method == "mv_matched"
+    if reference is not None and not matching:
+        config = _with_later_parts(config, reference)
     model = HyperPlanes(config, training.seed + matching).to(device)  # not the weights that mv_meta began with
     tasks = TasksOnDevice(data, torch.device(device))
     if matching:
@@ -80,10 +83,6 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
     if _goes_on(reference, folder):
         return
     found = HyperPlanes.from_pretrained(reference)
-    if model.gate is None:  # the model is trained before its gating network
-        found.gate = None
-    if model.learned_step is None:  # and before its learned step
-        found.learned_step = None
     if _shapes(model) != _shapes(found):
         config, names = found.config, model.config.differences(found.config)
         parts = {name: name.partition(".")[0] for name in names}
@@ -99,6 +98,17 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
         )
     model.load_state_dict(found.state_dict())
     _note(reference, folder)
+
+
+def _with_later_parts(config: ModelConfig, reference: Path) -> ModelConfig:
+    """The configuration with the learned steps and the gating network of a checkpoint, if its field is the same.
+
+    They were trained after the model, and no preset has them.
+    """
+    found = HyperPlanes.from_pretrained(reference).config
+    if found.target != config.target:
+        return config
+    return replace(config, learned_steps=config.learned_steps or found.learned_steps, gated=config.gated or found.gated)
 
 
 def _goes_on(reference: Path, folder: Path) -> bool:

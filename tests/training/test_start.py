@@ -1,5 +1,7 @@
 """Source of truth: the weights of the checkpoint that a training begins with."""
 
+from dataclasses import replace
+
 import torch
 
 from hyperplanes.adaptation import HyperPlanes
@@ -10,15 +12,18 @@ from tests.reference_rendering import Balls
 
 
 def test_a_training_with_its_preset_begins_with_the_packaged_weights(tmp_path):
-    """The gating network and the learned steps are left out, since they are trained after the model."""
+    """All of them: also the gating network and the learned steps, which no preset has, and which are not trained."""
     packaged, chosen = find_checkpoint("small"), preset("small")
-    trainer = start_training(chosen.model, chosen.training, Balls(), tmp_path, reference=packaged)
+    training = replace(chosen.training, steps=1, views=(2,), rays=4, tasks=1, volume_loss=0.0)
+    trainer = start_training(chosen.model, training, Balls(), tmp_path, reference=packaged)
     weights = HyperPlanes.from_pretrained(packaged).state_dict()
     found = trainer.model.state_dict()
-    later = [name for name in weights if name.startswith(("gate.", "learned_step."))]
-    assert [name for name in weights if name not in found] == later
-    assert all(torch.equal(value, weights[name]) for name, value in found.items() if name in weights)
-    assert found.keys() <= weights.keys()
+    assert found.keys() == weights.keys()
+    assert all(torch.equal(value, weights[name]) for name, value in found.items())
+    trainer.take_step()
+    changed = {name for name, value in trainer.model.state_dict().items() if not torch.equal(value, weights[name])}
+    assert any(name.startswith("hypernetwork.") for name in changed)
+    assert not any(name.startswith(("gate.", "learned_step.")) for name in changed)
 
 
 def test_the_preset_of_the_packaged_model_has_its_settings_of_views():
