@@ -38,7 +38,7 @@ def scene(elevation=0.6, views=12, seed=0, plane=False):
     observed = np.stack(np.meshgrid(np.arange(views), np.arange(len(points)), indexing="ij"), -1).reshape(-1, 2)
     model = SparseModel(
         np.arange(views), poses, np.tile(calibration, (views, 1, 1)), np.zeros((views, 2)), points,
-        np.zeros((len(points), 3), np.uint8), np.zeros(len(points)), observed, np.zeros((len(observed), 2)),
+        np.zeros((len(points), 3), np.uint8), np.zeros(len(points)), observed,
     )  # fmt: skip
     pixels = np.stack([model.project(view, points)[0].T for view in range(views)])
     rows, columns = np.mgrid[:SIZE, :SIZE]
@@ -51,7 +51,7 @@ def scene(elevation=0.6, views=12, seed=0, plane=False):
     kept = (seen & front).reshape(-1)
     return SparseModel(
         model.pictures, model.camera_from_world, model.calibrations, model.lenses, points, model.colours, model.errors,
-        observed[kept], pixels.reshape(-1, 2)[kept],
+        observed[kept],
     ), masks, middle  # fmt: skip
 
 
