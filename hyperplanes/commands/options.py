@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from hyperplanes.configuration.fine_tuning import Steps
+
 __all__ = [
     "Free",
     "ObjectArguments",
@@ -17,7 +19,6 @@ __all__ = [
     "OptionalName",
     "OptionalNumber",
     "Protocol",
-    "Steps",
     "ViewsArguments",
     "ViewsUp",
     "check_fine_tune",
@@ -39,9 +40,6 @@ OptionalNumber = Annotated[int | float | None, optional("NUMBER")]
 
 Protocol = Literal["default", "paper", "ray_marching"]
 """A name in `hyperplanes.configuration.presets.PROTOCOLS`."""
-
-Steps = int | Literal["auto"]
-"""A number of fine-tuning steps, or "auto" for the number that is best for held-out views."""
 
 Free = Literal["weights", "hypernetwork"]
 """What fine-tuning optimises."""

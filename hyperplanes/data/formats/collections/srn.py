@@ -16,7 +16,7 @@ from hyperplanes.data.pictures.images import image_size, read_image
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.axes import invert_poses
-from hyperplanes.utilities.files.reading import DataError, list_files, malformed
+from hyperplanes.utilities.files.reading import MANIFEST, DataError, list_files, malformed
 
 __all__ = ["catalogue", "is_srn", "read_srn"]
 
@@ -95,7 +95,7 @@ def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
         return None
     paths = {path.name: path for found in homes.values() for path in found}
     splits = {split: tuple(path.name for path in homes.get(split, [])) for split in ("train", "val", "test")}
-    bounds = stated_bounds(manifest, folder / "manifest.json")
+    bounds = stated_bounds(manifest, folder / MANIFEST)
 
     def read(name: str) -> PosedTask:
         return PosedTask.alternating(read_srn(paths[name], folder, bounds), name)
