@@ -95,12 +95,12 @@ class ImageBasedNeRF(Target):
 
     def __init__(self, config: ImageBasedConfig) -> None:
         super().__init__(config)
-        width, blended = config.width, config.blended
+        width = config.width
         if config.grid:
             self.grid = FeatureGrid(config.grid, config.cells)
         self.density = nn.Linear(width + 1, 1)
         self.view = nn.Linear(width + config.reading.near_size, width // 2)
-        self.colour = nn.Linear(width // 2, blended + 3)
+        self.colour = nn.Linear(width // 2, config.blended + 3)
         # initial heads give the visual hull: density follows the masks, colours are the plain blend
         with torch.no_grad():
             for layer in (self.density, self.view, self.colour):
