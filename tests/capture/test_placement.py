@@ -1,5 +1,7 @@
 """Source of truth: worlds with a known up direction and object, seen by cameras with known orientations."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
@@ -137,3 +139,14 @@ def test_without_masks_the_object_is_at_the_point_that_the_cameras_look_at(views
     assert 0.5 <= sphere.radius < 0.62
     alone = object_sphere(model, np.zeros_like(chosen))
     np.testing.assert_allclose([*alone.centre, alone.radius], [*middle, 1.2], atol=1e-4)
+
+
+def test_a_saved_model_is_read_back_also_from_a_file_with_another_array(tmp_path):
+    """Files of earlier versions have the pixels of the observations, too."""
+    model, _, _ = scene()
+    model.save(tmp_path / "model.npz")
+    with np.load(tmp_path / "model.npz") as arrays:
+        np.savez(tmp_path / "earlier.npz", **arrays, pixels=np.zeros((len(model.observed), 2)))
+    for name in ("model.npz", "earlier.npz"):
+        found = SparseModel.load(tmp_path / name)
+        assert all(np.array_equal(getattr(found, each.name), getattr(model, each.name)) for each in fields(SparseModel))
