@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from importlib import import_module
 from types import ModuleType
 from typing import Any, get_type_hints
 
@@ -78,12 +77,12 @@ def _main(arguments: Sequence[str] | None) -> int:
         return _print(f"hyperplanes {version('hyperplanes')}")
     verb, *rest = given
     try:
-        module = find_verb(verb).module
+        found = find_verb(verb)
     except ValueError as error:
         return _print_error(f"hyperplanes: {error}")
     try:
         with interruptible():
-            return _run(verb, module, rest)
+            return _run(verb, found.load(), rest)
     except KeyboardInterrupt as interrupt:
         advice = str(interrupt) or "the same command resumes where possible"
         code = interrupt.code if isinstance(interrupt, Terminated) else 130
@@ -116,10 +115,9 @@ def _one_line_warnings() -> Generator[None]:
         warnings.formatwarning = usual
 
 
-def _run(verb: str, name: str, rest: list[str]) -> int:
+def _run(verb: str, module: ModuleType, rest: list[str]) -> int:
     import tyro
 
-    module = import_module(name)
     _refuse_repeated(rest)
     settings: list[str] = []
     if "settings" in module.Arguments.__annotations__:  # options with a dot, such as --model.hypernetwork.views 3

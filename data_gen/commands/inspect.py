@@ -22,6 +22,7 @@ import tyro
 
 from hyperplanes.commands.options import OptionalFolder
 from hyperplanes.commands.output.console import Console
+from hyperplanes.utilities.files.reading import MANIFEST
 
 if TYPE_CHECKING:
     from hyperplanes.adaptation.diagnostics import Diagnostics
@@ -128,9 +129,9 @@ def _is_checkpoint(path: Path) -> bool:
 
 def _parts(folder: Path) -> list[Path]:
     """The checkpoints and data sets in a folder such as `demo` writes; empty for a folder that is a data set."""
-    if not folder.is_dir() or (folder / "manifest.json").exists():
+    if not folder.is_dir() or (folder / MANIFEST).exists():
         return []
-    names = ("*/model.json", "*/manifest.json", "first/*/manifest.json")
+    names = ("*/model.json", f"*/{MANIFEST}", f"first/*/{MANIFEST}")
     return sorted({path.parent for name in names for path in folder.glob(name)})
 
 

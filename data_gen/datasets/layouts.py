@@ -11,13 +11,12 @@ import numpy.typing as npt
 
 from data_gen.datasets.sources import Item
 from data_gen.rigs import DEFAULT_DISTANCE, OBJECT_RADIUS, Rig
+from hyperplanes.data.formats.collections import AUTHORS_FOCAL
 from hyperplanes.data.formats.scenes.transforms_document import transforms_document
 from hyperplanes.utilities.axes import flip_camera_axes
 from hyperplanes.utilities.files.encoding import encode_json, encode_npz, encode_png
 
 __all__ = ["LAYOUTS", "Layout", "RenderedObject", "check_names"]
-
-_AUTHORS_FOCAL = 277.77
 
 
 @dataclass(frozen=True)
@@ -232,7 +231,7 @@ LAYOUTS: dict[str, Layout] = {
     "hyperplanes-200": Layout(
         hyperplanes,
         planes={"": (2.0, 6.0)},
-        field_of_view=float(np.degrees(2 * np.arctan(100 / _AUTHORS_FOCAL))),
+        field_of_view=float(np.degrees(2 * np.arctan(100 / AUTHORS_FOCAL))),
         resolution=200,
         classes=("car", "chair", "plane"),
     ),

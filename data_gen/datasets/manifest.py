@@ -15,17 +15,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hyperplanes.utilities.files.encoding import encode_json, sha256
-from hyperplanes.utilities.files.reading import DataError, inside, malformed, read_bytes, read_json
+from hyperplanes.utilities.files.reading import DATA_SET, MANIFEST, DataError, inside, malformed, read_bytes, read_json
 from hyperplanes.utilities.files.settings import flattened
 from hyperplanes.utilities.files.writing import one_writer, write_whole
 
 if TYPE_CHECKING:
     from data_gen.datasets.sources import Item
 
-__all__ = ["FORMAT", "MANIFEST", "GenerationState", "Verification", "build_manifest", "holds_data_set", "verify"]
+__all__ = ["GenerationState", "Verification", "build_manifest", "holds_data_set", "verify"]
 
-MANIFEST = "manifest.json"
-FORMAT = "hyperplanes-dataset"
 VERSION = 1
 PROGRESS_FOLDER = ".progress"
 
@@ -90,7 +88,7 @@ def build_manifest(
     warned = [item.name for item in done if "warnings" in by_name[item.name]["record"]]
     splits = {split: [item.name for item in done if item.split == split] for split in ("train", "val", "test")}
     return {
-        "format": FORMAT,
+        "format": DATA_SET,
         "version": VERSION,
         **facts,
         "configuration": configuration,
@@ -108,7 +106,7 @@ def holds_data_set(folder: Path) -> bool:
     if (folder / PROGRESS_FOLDER / "configuration.json").is_file():
         return True
     with suppress(DataError):
-        return (folder / MANIFEST).is_file() and read_json(folder / MANIFEST).get("format") == FORMAT
+        return (folder / MANIFEST).is_file() and read_json(folder / MANIFEST).get("format") == DATA_SET
     return False
 
 

@@ -11,7 +11,6 @@ start, and importing torch and Kornia would add 1.4 s to each.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -90,11 +89,10 @@ class Rig:
         """Return the number of views."""
         return len(self.world_from_camera)
 
-    def cameras(self, views: Sequence[int] | slice = slice(None), dtype: torch.dtype | None = None) -> PinholeCamera:
+    def cameras(self, dtype: torch.dtype | None = None) -> PinholeCamera:
         """The cameras for `hyperplanes.geometry`.
 
         Args:
-            views: a selection; all by default.
             dtype: of the cameras; float64 by default.
 
         Returns:
@@ -104,8 +102,8 @@ class Rig:
 
         from hyperplanes.geometry.cameras import pinhole
 
-        extrinsics = as_tensor(np.linalg.inv(self.world_from_camera[views]), dtype=dtype)
-        return pinhole(as_tensor(self.intrinsics[views].copy(), dtype=dtype), extrinsics, self.height, self.width)
+        extrinsics = as_tensor(np.linalg.inv(self.world_from_camera), dtype=dtype)
+        return pinhole(as_tensor(self.intrinsics.copy(), dtype=dtype), extrinsics, self.height, self.width)
 
 
 def fitting_field_of_view(distance: float) -> float:

@@ -88,7 +88,7 @@ class _MovedCameras(nn.Module):
         return camera.with_poses(self.cameras, pose)
 
 
-def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], None] | None = None) -> Refined:
+def refine_poses(views: Views, *, on_step: Callable[[int, int], None] | None = None) -> Refined:
     """Views whose cameras fit the images better, if they did not fit well.
 
     Poses that are off by some degrees are corrected to a fraction of a pixel (docs/adaptation.md). Poses that are right
@@ -96,7 +96,6 @@ def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], N
 
     Args:
         views: of one object, with or without masks, without lens distortion.
-        seed: of rays and samples.
         on_step: called with the number of steps done and the total.
 
     Returns:
@@ -111,7 +110,7 @@ def refine_poses(views: Views, *, seed: int = 0, on_step: Callable[[int, int], N
             f"views: expected at least {FEWEST_VIEWS} without lens distortion to refine poses, got {found}"
         )
     views = views.to("cpu", torch.float32)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     cameras = _MovedCameras(views.cameras, views.bounds)
     motion = Adam([cameras.twist], betas=(0.9, 0.99))
     grid, done, total = _first_grid(views, LEVELS[0][1]), 0, sum(steps for _, _, steps in LEVELS)

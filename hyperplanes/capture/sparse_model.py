@@ -28,7 +28,6 @@ class SparseModel:
         colours: (point, 3), RGB with 8 bits.
         errors: (point,), mean reprojection error in pixels.
         observed: (observation, 2), the index of a camera and that of a point that it observes.
-        pixels: (observation, 2), the observed pixel coordinates (x, y), integer pixel centres.
     """
 
     pictures: Int[np.ndarray, " camera"]
@@ -39,7 +38,6 @@ class SparseModel:
     colours: UInt8[np.ndarray, "point 3"]
     errors: Float[np.ndarray, " point"]
     observed: Int[np.ndarray, "observation 2"]
-    pixels: Float[np.ndarray, "observation 2"]
 
     def __len__(self) -> int:
         return len(self.pictures)

@@ -230,7 +230,7 @@ def _map(pycolmap: Any, count: int, folder: Path, database: Path, progress: Prog
 
 
 def _sparse_model(model: Any, index: dict[str, int]) -> SparseModel:
-    """A model of COLMAP, from the indices of images by their names; its pixel coordinates get integer centres."""
+    """A model of COLMAP, from the indices of images by their names; principal points get integer pixel centres."""
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: index[image.name])
     poses = np.tile(np.eye(4), (len(images), 1, 1))
     calibrations = np.tile(np.eye(3), (len(images), 1, 1))
@@ -242,11 +242,7 @@ def _sparse_model(model: Any, index: dict[str, int]) -> SparseModel:
         focal, x, y, *lenses[row] = model.cameras[image.camera_id].params
         calibrations[row] = [[focal, 0, x - 0.5], [0, focal, y - 0.5], [0, 0, 1]]
     points = list(model.points3D.values())
-    observed, pixels = [], []
-    for row, point in enumerate(points):
-        for element in point.track.elements:
-            observed.append((at[element.image_id], row))
-            pixels.append(model.images[element.image_id].points2D[element.point2D_idx].xy - 0.5)
+    observed = [(at[each.image_id], row) for row, point in enumerate(points) for each in point.track.elements]
     return SparseModel(
         np.array([index[image.name] for image in images], np.int64),
         poses,
@@ -256,7 +252,6 @@ def _sparse_model(model: Any, index: dict[str, int]) -> SparseModel:
         np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         np.array([point.error for point in points], np.float64),
         np.array(observed, np.int64).reshape(-1, 2),
-        np.array(pixels, np.float64).reshape(-1, 2),
     )
 
 

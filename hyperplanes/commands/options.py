@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from hyperplanes.configuration.fine_tuning import Steps
 from hyperplanes.data.packaged import locate_scene
 from hyperplanes.utilities.files.reading import DataError
 
@@ -23,7 +24,6 @@ __all__ = [
     "OptionalName",
     "OptionalNumber",
     "Protocol",
-    "Steps",
     "ViewsArguments",
     "ViewsUp",
     "check_fine_tune",
@@ -85,9 +85,6 @@ OptionalNumber = Annotated[int | float | None, optional("NUMBER")]
 
 Protocol = Literal["default", "paper", "ray_marching"]
 """A name in `hyperplanes.configuration.presets.PROTOCOLS`."""
-
-Steps = int | Literal["auto"]
-"""A number of fine-tuning steps, or "auto" for the number that is best for held-out views."""
 
 Free = Literal["weights", "hypernetwork"]
 """What fine-tuning optimises."""

@@ -12,6 +12,7 @@ from hyperplanes.utilities.messages.arguments import checked_fields
 __all__ = ["AVERAGE", "CELLS", "FINE_VIEWS", "FRESH", "MANY_VIEWS", "RATES", "FineTuning", "Steps"]
 
 Steps: TypeAlias = int | Literal["auto"]
+"""A number of fine-tuning steps, or "auto" for the number that is best for held-out views."""
 
 RATES: dict[str, tuple[Literal["adam", "muon"], float, float]] = {
     "weights": ("muon", 2e-3, 0.04),

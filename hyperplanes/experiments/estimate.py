@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.experiments.engine import Runner
@@ -28,12 +29,11 @@ class Estimate:
     Attributes:
         rows: one row of text per training.
         seconds: the time of everything.
-        headings: the headings of the rows.
     """
 
     rows: Sequence[tuple[str, ...]]
     seconds: float
-    headings: tuple[str, ...] = ("training", "steps", "rays/s", "to train", "to evaluate")
+    headings: ClassVar[tuple[str, ...]] = ("training", "steps", "rays/s", "to train", "to evaluate")
 
 
 def estimate(runner: Runner, experiment: Experiment, seeds: int) -> Estimate:

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from hyperplanes.adaptation.checkpoints import packaged_folder
 from hyperplanes.configuration.presets import Preset
@@ -19,6 +19,9 @@ from hyperplanes.experiments.paper.experiment import Experiment, Trained
 from hyperplanes.experiments.workers import Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.views import Tasks
+
+if TYPE_CHECKING:
+    from hyperplanes.experiments.engine import Runner
 
 __all__ = ["Train", "Trainings"]
 
@@ -136,12 +139,6 @@ class Trainings:
         }
 
 
-class _HasTrainings(Protocol):
-    """The runner of a worker process."""
-
-    trainings: Trainings
-
-
-def _train(trained: Trained, chosen: Preset, folder: Path, runner: _HasTrainings) -> None:
+def _train(trained: Trained, chosen: Preset, folder: Path, runner: Runner) -> None:
     trainings = runner.trainings
     trainings.train(trained, chosen, trainings.arranged(trained, chosen), None, folder)

@@ -14,20 +14,16 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import torch
 
-from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.utilities.machine.interrupts import interruptible
 
+if TYPE_CHECKING:
+    from hyperplanes.experiments.engine import Runner
+
 __all__ = ["Result", "Workers"]
-
-
-class HasData(Protocol):
-    """The object with which a process does its work: `experiments.engine.Runner`."""
-
-    data: DataSets
 
 
 Result = TypeVar("Result")
@@ -52,7 +48,7 @@ class Workers:
         ChildProcessError: at the end of the context, if a process was killed.
     """
 
-    def __init__(self, count: int, make: Callable[[], HasData]) -> None:
+    def __init__(self, count: int, make: Callable[[], Runner]) -> None:
         self.count, self._make = count, make
         self._pool: ProcessPoolExecutor | None = None
 
@@ -104,10 +100,10 @@ class Workers:
         return self._pool
 
 
-_runner: HasData  # the object made by `make`, in a worker process
+_runner: Runner  # the object made by `make`, in a worker process
 
 
-def _start(make: Callable[[], HasData]) -> None:
+def _start(make: Callable[[], Runner]) -> None:
     global _runner
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, and the parent ends its workers
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

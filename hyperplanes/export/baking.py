@@ -119,7 +119,8 @@ def bake(adapted: AdaptedField, *, side: int = 256, on_part: Callable[[int, int]
     # transmittance from outside to coarse voxels, along every direction
     coarse = _in_sphere(_resampled(adapted.refined_occupancy, side // coarser))
     optical_depth = torch.zeros_like(coarse.occupied, dtype=view.dtype)
-    optical_depth[coarse.occupied] = _density_at(adapted, coarse.centres()) * coarse.voxel
+    density = torch.cat([adapted.density(part) for part in coarse.centres().split(CHUNK)])
+    optical_depth[coarse.occupied] = density * coarse.voxel
     arriving = transmittance(optical_depth, coarse.occupied.nonzero(), view)
     # voxels that are visible from some direction
     visible = torch.zeros_like(coarse.occupied)
@@ -208,10 +209,6 @@ def _in_sphere(occupancy: Occupancy) -> Occupancy:
     along = ((torch.arange(side, device=occupancy.occupied.device) + 0.5) * (2 / side) - 1).square()
     away = along[:, None, None] + along[:, None] + along
     return Occupancy(occupancy.occupied & (away.sqrt() <= 1 + 2 / side), occupancy.bounds)
-
-
-def _density_at(adapted: AdaptedField, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-    return torch.cat([adapted.density(part) for part in points.split(CHUNK)])
 
 
 def _harmonics(

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from hyperplanes.export.baking import BakedScene
 from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels, upward
 from hyperplanes.fields.baked import HARMONICS, BakedField
 from hyperplanes.geometry import cameras as camera
@@ -33,7 +34,7 @@ AROUND = 4096
 BITS = ((8, 8, 8), (8, 7, 6), (8, 6, 5), (8, 6, 4), (7, 5, 3), (7, 5, 0))
 """Bits of the mean colour, the first and the second order; 0 omits an order. Tried in turn until the page fits."""
 
-STEPS = 192  # samples along a diameter of the scene's sphere, as in `BakedScene`
+FRAMES, SIZE = 24, 256  # of a turntable; pixels along the longer side
 OWN = 8.0  # weight of a voxel's own colour, beside 1 of each neighbour, when colours are prepared for the page
 CLAMP = 1e-3  # share of a coefficient's values clamped at either end of its range
 STYLE = """<style>
@@ -85,7 +86,7 @@ def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: i
         "rows": len(baked.values),
         "centre": baked.bounds.centre,
         "radius": baked.bounds.radius,
-        "steps": STEPS,
+        "steps": BakedScene.steps,
         "up": upward(views.cameras),
         "eye": camera.centres(start)[0].tolist(),
         "focal": float(camera.intrinsics(start)[0, 0, 0]) / min(camera.image_size(start)),
@@ -147,18 +148,14 @@ def address_of(cameras: PinholeCamera) -> str:
     return "#camera=" + ",".join(f"{number:.9g}" for number in numbers)
 
 
-def turning_picture(baked: BakedField, views: Views, *, frames: int = 24, size: int = 256) -> bytes:
+def turning_picture(baked: BakedField, views: Views) -> bytes:
     """A turntable as an animated WebP, for `page_of` to fall back to.
 
     Args:
         baked: the voxels to render.
         views: give lens, distance and up.
-        frames: number of frames.
-        size: pixels along the longer side.
     """
-    from hyperplanes.export.baking import BakedScene
-
-    images = BakedScene(baked).render(orbit_cameras(views, frames, size=size)).images
+    images = BakedScene(baked).render(orbit_cameras(views, FRAMES, size=SIZE)).images
     return encode_animation(to_pixels(images), "webp")
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from hyperplanes.fields.baked import HARMONICS, BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
+from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.rendering.splats import render_splats
 from hyperplanes.utilities.files.reading import format_of
 from hyperplanes.utilities.files.writing import write_whole
@@ -82,10 +83,9 @@ class Splats:
 @checked
 def splats_of(baked: BakedField) -> Splats:
     """One round splat a voxel, with its opacity and colours."""
-    places = (baked.index >= 0).nonzero()
-    rows = baked.values[baked.index[baked.index >= 0].long()]
-    voxel = 2 * baked.bounds.radius / baked.side
-    means = (places.float() + 0.5) * voxel + (torch.tensor(baked.bounds.centre) - baked.bounds.radius)
+    filled = Occupancy(baked.index >= 0, baked.bounds)
+    rows = baked.values[baked.index[filled.occupied].long()]
+    means, voxel = filled.centres(), filled.voxel
     opacity = (1 - torch.exp(-rows[:, 0] * voxel)).clamp(0.004, 0.98)
     unturned = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1)
     scales = torch.full((len(means), 3), SIZE * voxel)
@@ -99,7 +99,6 @@ def fit_splats(
     *,
     guide: Views | None = None,
     steps: int = STEPS,
-    seed: int = 0,
     on_step: Callable[[int], None] | None = None,
 ) -> Splats:
     """The visible splats after gradient steps (Adam) on all their parameters, one view a step.
@@ -115,7 +114,6 @@ def fit_splats(
         views: posed images of the object, without lens distortion.
         guide: renderings of the voxels from other places, `render_guide(..., size=views.size)`; views like the others.
         steps: gradient steps.
-        seed: for the order of the views.
         on_step: called with the number of steps done.
 
     Returns:
@@ -155,7 +153,7 @@ def fit_splats(
             splats.coefficients + free["coefficients"] * rate,
         )
 
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     # every view equally often, in random order
     order = torch.cat([torch.randperm(len(views), generator=generator) for _ in range(-(-steps // len(views)))])
     for step, view in enumerate(order[:steps].tolist()):

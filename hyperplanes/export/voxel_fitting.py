@@ -74,7 +74,6 @@ def fit_voxels(
     guide: Views | None = None,
     steps: int = STEPS,
     pixels: int = PIXELS,
-    seed: int = 0,
     on_step: Callable[[int], None] | None = None,
 ) -> BakedField:
     """The voxels after gradient steps (Adam) on the squared error of pixels of the views.
@@ -91,7 +90,6 @@ def fit_voxels(
             drawn.
         steps: gradient steps.
         pixels: per step, drawn from all views; at most those that may show a voxel.
-        seed: for drawing pixels.
         on_step: called with the number of steps done.
 
     Returns:
@@ -112,7 +110,7 @@ def fit_voxels(
     # reused by the kernel: allocating memory in each step would take longer than filling it
     values, gradients = baked.values.clone(), torch.empty(torch.get_num_threads(), *baked.values.shape)
     depth.grad, colour.grad = torch.zeros_like(depth), torch.zeros_like(colour)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     for step in range(steps):
         # gradient of the squared error of some rays, by the kernel
         drawn, truth, counts = _draw(sources, generator)

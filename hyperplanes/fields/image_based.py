@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad, relu, softplus
 
 from hyperplanes.fields.base import Field, Target, TargetConfig
-from hyperplanes.fields.encoding import encode, encoded_size
+from hyperplanes.fields.encoding import encode
 from hyperplanes.fields.rig import Rig
 from hyperplanes.geometry.chosen_views import ChosenViews, Described, Reading, Visibility
 from hyperplanes.geometry.occupancy import Occupancy
@@ -41,11 +41,6 @@ SOLID = 4.0  # and inside
 
 GRID_RATES = {"learning_rate": 2e-2, "muon_learning_rate": 0.05}
 """For fine-tuning the weights of a field with a grid of features, trained or random; docs/small-training.md."""
-
-
-READ = 9  # inputs of the trunk from each view: colour, depth, coverage, validity, direction
-BLENDED = 7  # inputs of the colour head from each view: colour, angle, depth, coverage, validity
-OVERALL = 11  # mean, variance and difference to the best of the colours, least coverage, number of views
 
 
 class FeatureGrid(nn.Module):
@@ -79,6 +74,11 @@ class ImageBasedConfig(TargetConfig):
     grid: Annotated[int, range(65)] = 0
     cells: Annotated[int, range(1, 257)] = SIDE
 
+    @property
+    def reading(self) -> Reading:
+        """What the network reads of the views at each point."""
+        return Reading(self.planes, self.blended, self.point_frequencies, self.direction_frequencies, FALLOFF)
+
 
 class ImageBasedNeRF(Target):
     """F(x, z, d; theta) = (c, sigma), where z is sorted by visibility.
@@ -95,12 +95,12 @@ class ImageBasedNeRF(Target):
 
     def __init__(self, config: ImageBasedConfig) -> None:
         super().__init__(config)
-        width, blended = config.width, config.blended
+        width = config.width
         if config.grid:
             self.grid = FeatureGrid(config.grid, config.cells)
         self.density = nn.Linear(width + 1, 1)
-        self.view = nn.Linear(width + encoded_size(config.direction_frequencies) + BLENDED * blended, width // 2)
-        self.colour = nn.Linear(width // 2, blended + 3)
+        self.view = nn.Linear(width + config.reading.near_size, width // 2)
+        self.colour = nn.Linear(width // 2, config.blended + 3)
         # initial heads give the visual hull: density follows the masks, colours are the plain blend
         with torch.no_grad():
             for layer in (self.density, self.view, self.colour):
@@ -114,8 +114,7 @@ class ImageBasedNeRF(Target):
     @property
     def input_size(self) -> int:
         """The encoded point, the inputs from the best views, their statistics, and features of the grid."""
-        config = self.config
-        return encoded_size(config.point_frequencies) + READ * config.planes + OVERALL + config.grid
+        return self.config.reading.row_size + self.config.grid
 
     @property
     def fine_tuning_rates(self) -> Mapping[str, float]:
@@ -245,15 +244,10 @@ class ImageBasedField(Field):
         """Colour in [0, 1] as seen along unit directions."""
         points, config = hidden.points, self.target.config
         if self._is_described(points, directions):
-            near = self.planes.describe(points, directions, replace(self._reading, best=0), self.bounds)
+            near = self.planes.describe(points, directions, replace(config.reading, best=0), self.bounds)
             return self._coloured(hidden.values, near)
         visibility = self.planes.choose(points, directions, best=0, nearest=config.blended)
         return self._colour(hidden.values, visibility, self.planes.colours.lookup(points).colours, directions)
-
-    @property
-    def _reading(self) -> Reading:
-        config = self.target.config
-        return Reading(config.planes, config.blended, config.point_frequencies, config.direction_frequencies, FALLOFF)
 
     def _is_described(self, points: Tensor, directions: Tensor | None = None) -> bool:
         """Whether one kernel computes the inputs of the network; not for subclasses, which may read something else."""
@@ -264,7 +258,9 @@ class ImageBasedField(Field):
         """The inputs of the trunk, the least coverage and, with directions, the inputs of the colour head."""
         grid = self.parameters.get("grid.weight")
         learned = grid is not None and not wants_values_alone(grid)
-        found = self.planes.describe(points, directions, self._reading, self.bounds, None if learned else self._cells)
+        found = self.planes.describe(
+            points, directions, self.target.config.reading, self.bounds, None if learned else self._cells
+        )
         if not learned:
             return found.rows, found.coverage, found
         return torch.cat([found.rows, *self._features(points)], 1), found.coverage, found
@@ -291,7 +287,7 @@ class ImageBasedField(Field):
     def _hidden(self, points: Tensor, visibility: Visibility, shown: Tensor) -> Float[Tensor, "point width"]:
         """The trunk at points, which reads the `config.planes` views that see them best; `shown` has all colours."""
         config, seen = self.target.config, visibility.best
-        # colours of the best views, from [0, 1] to [-1, 1]: (point, chosen, 3), then all inputs: (point, chosen, READ)
+        # colours of the best views, from [0, 1] to [-1, 1]: (point, chosen, 3), then all inputs: (point, chosen, 9)
         colours = (2 * _of(shown, seen.views) - 1) * seen.valid[..., None]
         slots = torch.cat([colours, _described(seen), seen.directions * seen.valid[..., None]], -1)
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, grid_sample, interpolate
 
 from hyperplanes.geometry.chosen_views import Reading
+from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 
@@ -35,12 +36,11 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
     # the share of each cell inside the hull (x, y, z), and the centres of cells where it is not zero
     share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.maps), SIDE)[0, 0]
     cells = (share > 0).nonzero()
-    unit = (cells.to(share) + 0.5) * (2 / SIDE) - 1
-    points = unit * occupancy.bounds.radius + unit.new_tensor(occupancy.bounds.centre)
+    points = Occupancy(share > 0, occupancy.bounds).centres_of(cells).to(share)
     # mean colour of the views that see a cell best (cell, 3), and how many show it, as a logarithm
     if planes.can_describe(points):
         rows = planes.describe(points, None, _READING, occupancy.bounds).rows
-        mean, number = rows[:, _READING.row_size - 11 : _READING.row_size - 8], rows[:, -1]
+        mean, number = rows[:, -11:-8], rows[:, -1]
     else:
         visibility = planes.choose(points, best=BEST)
         seen = visibility.best

@@ -103,9 +103,7 @@ def shade_voxels(
     return out
 
 
-def render_voxels(
-    grid: VoxelGrid, shaded: Float[Tensor, "padded_row 4"], rays: Rays, *, step: float, stop: float = STOP
-) -> Rendered:
+def render_voxels(grid: VoxelGrid, shaded: Float[Tensor, "padded_row 4"], rays: Rays, *, step: float) -> Rendered:
     """The pixels of rays through a baked field: the same sums as for `RayMarching`, in a compiled loop per ray.
 
     Args:
@@ -113,15 +111,13 @@ def render_voxels(
         shaded: the result of `shade_voxels` for the camera that the rays come from.
         rays: with near and far.
         step: distance between samples in world units.
-        stop: transmittance below which a ray ends.
 
     Returns:
         Pixels; `samples` counts those with positive density.
     """
     kernel = compile_function(voxel_rays.render)
     out = np.empty((len(rays), 5), np.float32)
-    arrays = _arrays(grid, shaded, rays)
-    numbers = _numbers(step, stop)
+    arrays, numbers = _arrays(grid, shaded, rays), _numbers(step, STOP)
     samples = sum(parallel_for(lambda first, last: kernel(*arrays, *numbers, out, first, last), len(rays), RAYS))
     found = torch.from_numpy(out)
     return Rendered(found[:, :3], found[:, 3], found[:, 4], samples)

@@ -20,6 +20,8 @@ from hyperplanes.training.forward import ForwardOutput
 
 __all__ = ["EmptinessLoss", "VolumeLoss", "losses_of", "photometric_loss", "thin_opacity"]
 
+EMPTINESS_WEIGHT = 0.01  # the factor of `EmptinessLoss`; that of the squared error of pixels is 1
+
 
 def losses_of(config: TrainingConfig) -> list[Callable[[ForwardOutput], Tensor]]:
     """The losses of a training, in the order in which they are summed.
@@ -53,11 +55,9 @@ class EmptinessLoss:
 
     Attributes:
         points: the number of random points per object and step.
-        weight: the factor of this loss; that of the squared error of pixels is 1.
     """
 
     points: int
-    weight: float = 0.01
 
     def __call__(self, output: ForwardOutput) -> Tensor:
         """The loss of the field of one object, plus that of its proposal field if it has one."""
@@ -67,7 +67,9 @@ class EmptinessLoss:
             points = points_in(bounds, self.points, output.generator).to(device)
             points = points[~field.occupancy.contains(points)].to(field.dtype)
             opacity = [thin_opacity(density(points), bounds) for density in field.densities]
-            return self.weight * sum((each.sum() for each in opacity), torch.zeros((), device=device)) / self.points
+            return (
+                EMPTINESS_WEIGHT * sum((each.sum() for each in opacity), torch.zeros((), device=device)) / self.points
+            )
 
 
 @dataclass(frozen=True)

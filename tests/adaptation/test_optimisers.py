@@ -29,7 +29,7 @@ def test_steps_of_muon_agree_with_torch():
     ours, theirs = torch.randn(24, 40, requires_grad=True), torch.empty(24, 40, requires_grad=True)
     start = ours.detach().clone()
     theirs.data.copy_(start)
-    pair = Muon([ours], 0.1, 0.95), torch.optim.Muon([theirs], lr=0.1, momentum=0.95, weight_decay=0.0)
+    pair = Muon([ours], 0.1), torch.optim.Muon([theirs], lr=0.1, momentum=0.95, weight_decay=0.0)
     for _ in range(5):
         ours.grad = torch.randn(24, 40)
         theirs.grad = ours.grad.clone()
@@ -50,7 +50,7 @@ def test_tensors_that_are_not_on_a_cpu_are_stepped_in_the_calling_thread(monkeyp
     values = [torch.zeros(4, 4, device=device, requires_grad=True) for _ in range(2)]
     for value in values:
         value.grad = torch.zeros_like(value)
-    Muon(values, 0.1, 0.95).step()
+    Muon(values, 0.1).step()
     assert len(seen) == 2
     assert (get_ident() not in seen) == shared
 

@@ -102,10 +102,9 @@ def ball_seen():
     count, size = 16, 96
     poses = camera.orbit(count, 3.0, 0.3).numpy().astype(float)
     calibration = np.tile(np.array([[110.0, 0, 47.5], [0, 110.0, 47.5], [0, 0, 1]]), (count, 1, 1))
-    nothing = np.zeros((0, 2))
     model = SparseModel(
         np.arange(count), poses, calibration, np.zeros((count, 2)), np.zeros((0, 3)), np.zeros((0, 3), np.uint8),
-        np.zeros(0), nothing.astype(int), nothing,
+        np.zeros(0), np.zeros((0, 2), int),
     )  # fmt: skip
     rows, columns = np.mgrid[:size, :size]
     mask = np.hypot(rows - 47.5, columns - 47.5) < 110 * 0.7 / np.sqrt(9 - 0.49)
@@ -178,8 +177,8 @@ def test_points_label_the_pixels_in_which_they_are_observed(ball_seen):
 
     model, pose = ball_seen[0], np.linalg.inv(ball_seen[0].camera_from_world[0])
     point = pose[:3, :3] @ np.linalg.solve(model.calibrations[0], [43.0, 23.0, 1.0]) * 3 + pose[:3, 3]
-    seen = {"observed": np.array([[0, 0]]), "pixels": np.array([[43.0, 23.0]])}
-    model = replace(model, points=point[None], colours=np.zeros((1, 3), np.uint8), errors=np.zeros(1), **seen)
+    seen = {"points": point[None], "colours": np.zeros((1, 3), np.uint8), "observed": np.array([[0, 0]])}
+    model = replace(model, errors=np.zeros(1), **seen)
     labels = GrabCut(model)._seeds(0, (24, 24), 0.25)
     assert np.argwhere(labels == cv2.GC_FGD).mean(0).tolist() == [5, 10]
 

@@ -1,5 +1,7 @@
 """Source of truth: worlds with a known up direction and object, seen by cameras with known orientations."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
@@ -38,7 +40,7 @@ def scene(elevation=0.6, views=12, seed=0, plane=False):
     observed = np.stack(np.meshgrid(np.arange(views), np.arange(len(points)), indexing="ij"), -1).reshape(-1, 2)
     model = SparseModel(
         np.arange(views), poses, np.tile(calibration, (views, 1, 1)), np.zeros((views, 2)), points,
-        np.zeros((len(points), 3), np.uint8), np.zeros(len(points)), observed, np.zeros((len(observed), 2)),
+        np.zeros((len(points), 3), np.uint8), np.zeros(len(points)), observed,
     )  # fmt: skip
     pixels = np.stack([model.project(view, points)[0].T for view in range(views)])
     rows, columns = np.mgrid[:SIZE, :SIZE]
@@ -51,7 +53,7 @@ def scene(elevation=0.6, views=12, seed=0, plane=False):
     kept = (seen & front).reshape(-1)
     return SparseModel(
         model.pictures, model.camera_from_world, model.calibrations, model.lenses, points, model.colours, model.errors,
-        observed[kept], pixels.reshape(-1, 2)[kept],
+        observed[kept],
     ), masks, middle  # fmt: skip
 
 
@@ -137,3 +139,14 @@ def test_without_masks_the_object_is_at_the_point_that_the_cameras_look_at(views
     assert 0.5 <= sphere.radius < 0.62
     alone = object_sphere(model, np.zeros_like(chosen))
     np.testing.assert_allclose([*alone.centre, alone.radius], [*middle, 1.2], atol=1e-4)
+
+
+def test_a_saved_model_is_read_back_also_from_a_file_with_another_array(tmp_path):
+    """Files of earlier versions have the pixels of the observations, too."""
+    model, _, _ = scene()
+    model.save(tmp_path / "model.npz")
+    with np.load(tmp_path / "model.npz") as arrays:
+        np.savez(tmp_path / "earlier.npz", **arrays, pixels=np.zeros((len(model.observed), 2)))
+    for name in ("model.npz", "earlier.npz"):
+        found = SparseModel.load(tmp_path / name)
+        assert all(np.array_equal(getattr(found, each.name), getattr(model, each.name)) for each in fields(SparseModel))

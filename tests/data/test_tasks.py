@@ -14,9 +14,8 @@ from PIL import Image
 
 from hyperplanes.data import DataError, Dataset, open_dataset
 from hyperplanes.data.dataset import open_datasets
-from hyperplanes.data.formats.catalogue import FORMAT
 from hyperplanes.utilities.files.encoding import encode_npz, encode_png
-from hyperplanes.utilities.files.reading import read_json
+from hyperplanes.utilities.files.reading import DATA_SET, read_json
 from hyperplanes.utilities.files.writing import write_folder, write_whole
 
 
@@ -26,7 +25,7 @@ def folder(scene, tmp_path):
     for name in ("a", "b", "c"):
         scene.write(tmp_path / name, document)
     splits = {"train": ["a", "b"], "val": [], "test": ["c"]}
-    (tmp_path / "manifest.json").write_text(json.dumps({"format": FORMAT, "version": 1, "splits": splits}))
+    (tmp_path / "manifest.json").write_text(json.dumps({"format": DATA_SET, "version": 1, "splits": splits}))
     return tmp_path
 
 
@@ -36,7 +35,7 @@ def test_names_and_length(folder):
     assert data.names() == data.names("all") == ["a", "b", "c"]
     assert len(data) == 3
     assert [task.name for task in data] == ["a", "b", "c"]
-    assert data.manifest["format"] == FORMAT
+    assert data.manifest["format"] == DATA_SET
     with pytest.raises(ValueError, match="split: expected one of train, val, test, all, got 'dev'"):
         data.names("dev")
 

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from hyperplanes.data import DataError, Dataset, open_dataset, read_channel, read_task, read_views
-from hyperplanes.data.formats.catalogue import FORMAT
 from hyperplanes.data.formats.collections.npz import read_npz
+from hyperplanes.utilities.files.reading import DATA_SET
 
 
 def refused(action, *argument, match):
@@ -68,7 +68,7 @@ def test_missing_pictures(scene, tmp_path):
 
 
 def test_a_missing_picture_of_a_generated_object(scene, tmp_path):
-    manifest = {"format": FORMAT, "version": 1, "splits": {"train": ["a"]}}
+    manifest = {"format": DATA_SET, "version": 1, "splits": {"train": ["a"]}}
     (scene.write(tmp_path / "a") / scene.names[2]).unlink()
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     refused(Dataset(tmp_path).task, "a", match=r"002\.png: expected an image, found nothing; generate or copy")
@@ -148,11 +148,11 @@ def test_a_link_that_leaves_the_folder_is_refused(scene, tmp_path):
 
 def test_manifests(scene, tmp_path):
     path = tmp_path / "manifest.json"
-    path.write_text(json.dumps({"format": FORMAT, "version": 9}))
+    path.write_text(json.dumps({"format": DATA_SET, "version": 9}))
     refused(Dataset, tmp_path, match="expected version 1, found 9")
-    path.write_text(json.dumps({"format": FORMAT, "version": 1, "splits": {"train": ["../x"]}}))
+    path.write_text(json.dumps({"format": DATA_SET, "version": 1, "splits": {"train": ["../x"]}}))
     refused(Dataset, tmp_path, match=r"expected plain names in splits\.train")
-    path.write_text(json.dumps({"format": FORMAT, "version": 1, "splits": {"train": ["a"]}}))
+    path.write_text(json.dumps({"format": DATA_SET, "version": 1, "splits": {"train": ["a"]}}))
     refused(Dataset(tmp_path).task, "b", match=r"expected one of its 1 objects \(a\), found 'b'")
     refused(Dataset(tmp_path).task, "a", match="expected transforms.json or transforms_train.json, found neither")
 

@@ -131,7 +131,7 @@ def test_presets():
 
 def test_poses_are_those_of_the_cameras_of_hyperplanes():
     rig = replace(rigs.fixed(6, 10), width=20)
-    part = rig.cameras([4, 0])
+    part = camera.select(rig.cameras(), [4, 0])
     assert camera.image_size(part) == (10, 20)
     expected = look_at(torch.from_numpy(rig.world_from_camera[[4, 0], :3, 3]))
     assert torch.allclose(camera.camera_from_world(part), expected, atol=1e-12)

@@ -143,7 +143,7 @@ def test_a_constant_slab_is_beer_lambert():
     )
     field = BakedField(index, values, Sphere())
     shaded = shade_voxels(values, field.centres(), rays.origins[0])
-    seen = render_voxels(VoxelGrid.of(index, Sphere()), shaded, rays, step=1.8 / 512, stop=1e-9)
+    seen = render_voxels(VoxelGrid.of(index, Sphere()), shaded, rays, step=1.8 / 512)
     assert float(seen.opacity) == pytest.approx(1 - math.exp(-2 * 1.8), abs=1e-3)
     assert torch.allclose(seen.colour, (1 - seen.opacity)[:, None].expand(1, 3), atol=1e-5)  # black over white
 

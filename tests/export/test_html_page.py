@@ -16,6 +16,7 @@ from PIL import Image
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.baking import BakedScene, bake
+from hyperplanes.export.images import encode_animation, to_pixels
 from hyperplanes.export.page import AROUND, address_of, page_of, save_page, turning_picture
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
@@ -65,7 +66,7 @@ def coarse():
 def small(views):
     """A fragment of a page that renders quickly."""
     tiny = bake(AdaptedField(two_balls, full(SPHERE, 8), RayMarching(16)), side=8)
-    fragment = page_of(tiny, views, picture=turning_picture(tiny, views, frames=1, size=8))
+    fragment = page_of(tiny, views, picture=encode_animation(to_pixels(views.images[:1]), "webp"))
     return f'<div style="width:40px;float:left">{fragment}</div>'
 
 
@@ -256,8 +257,9 @@ def test_a_typed_camera_address_is_used_only_if_it_is_valid(small, tmp_path):
     assert told == ["turns"] * 6 + ["12x8"]
 
 
-def test_a_page_is_one_file_without_external_resources(coarse, views, tmp_path):
-    picture = turning_picture(coarse, views, frames=2, size=32)
+def test_a_page_is_one_file_without_external_resources(coarse, views, tmp_path, monkeypatch):
+    monkeypatch.setattr("hyperplanes.export.page.SIZE", 32)
+    picture = turning_picture(coarse, views)
     text = save_page(page_of(coarse, views, picture=picture), tmp_path / "page.html", "Two <balls>").read_text()
     assert "<title>Two &lt;balls&gt;</title>" in text
     assert "data:image/webp;base64," in text

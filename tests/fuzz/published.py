@@ -116,7 +116,7 @@ class Published:
         observed = np.array([[view, point] for view in range(count) for point in range(2)])
         return SparseModel(
             np.arange(count), self.poses, np.stack([matrix] * count), np.zeros((count, 2)), points,
-            np.zeros((2, 3), np.uint8), np.ones(2), observed, np.zeros((len(observed), 2)),
+            np.zeros((2, 3), np.uint8), np.ones(2), observed,
         )  # fmt: skip
 
     def capture(self, folder):

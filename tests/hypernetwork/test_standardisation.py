@@ -3,14 +3,16 @@
 import pytest
 import torch
 
+from hyperplanes.hypernetwork.images import standardisation
 from hyperplanes.hypernetwork.images.standardisation import EPSILON, RunningStandardisation
 
 
-def test_the_statistics_converge_to_those_of_the_inputs():
+def test_the_statistics_converge_to_those_of_the_inputs(monkeypatch):
     # Statistics: codes with known mean and variance, 4 objects per step.
     generator = torch.Generator().manual_seed(0)
     mean, deviation = torch.tensor([5.0, -3.0]), torch.tensor([0.1, 4.0])
-    layer = RunningStandardisation((2,), momentum=0.01)
+    monkeypatch.setattr(standardisation, "MOMENTUM", 0.01)
+    layer = RunningStandardisation((2,))
     for _ in range(2000):
         layer(mean + deviation * torch.randn(4, 2, generator=generator))
     torch.testing.assert_close(layer.mean, mean, atol=0.3, rtol=0.05)
@@ -22,7 +24,7 @@ def test_the_statistics_converge_to_those_of_the_inputs():
 
 
 def test_the_first_steps_are_averaged_evenly():
-    layer = RunningStandardisation((1,), momentum=0.1)
+    layer = RunningStandardisation((1,))
     for value in (1.0, 2.0, 6.0):
         layer(torch.tensor([[value]]))
     assert layer.mean.item() == pytest.approx(3.0)

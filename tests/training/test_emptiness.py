@@ -10,7 +10,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.rendering import RayMarching
-from hyperplanes.training.losses import EmptinessLoss
+from hyperplanes.training.losses import EMPTINESS_WEIGHT, EmptinessLoss
 
 DENSITY = 2.5
 
@@ -29,9 +29,8 @@ def test_only_density_outside_the_hull_counts_in_every_unit(occupied, share, net
         return scale * torch.full((len(points),), DENSITY / unit)
 
     field = AdaptedField(None, Occupancy(voxels, bounds), RayMarching(), densities=(density,) * networks)
-    emptiness = EmptinessLoss(4000)
-    loss = emptiness(SimpleNamespace(field=field, generator=torch.Generator().manual_seed(0)))
-    expected = networks * share * emptiness.weight * (1 - math.exp(-DENSITY * 2 / 10))
+    loss = EmptinessLoss(4000)(SimpleNamespace(field=field, generator=torch.Generator().manual_seed(0)))
+    expected = networks * share * EMPTINESS_WEIGHT * (1 - math.exp(-DENSITY * 2 / 10))
     assert float(loss.detach()) == pytest.approx(expected, rel=0.05, abs=1e-12)
     if share:
         loss.backward()

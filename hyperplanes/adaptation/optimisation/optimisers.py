@@ -16,6 +16,7 @@ __all__ = ["Muon", "make_optimisers", "orthogonalise"]
 
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of the quintic Newton-Schulz iteration of Jordan et al. 2024
 ITERATIONS = 5
+MOMENTUM = 0.95  # of Muon
 NARROWEST = 16  # matrices with fewer rows or columns, such as the heads of colour and density, are left to Adam
 
 
@@ -48,11 +49,10 @@ class Muon(Optimizer):
     Args:
         parameters: matrices.
         lr: learning rate; the update of a matrix has spectral norm about lr sqrt(max(1, rows / columns)).
-        momentum: of the gradients.
     """
 
-    def __init__(self, parameters: Iterable[Tensor], lr: float = 0.02, momentum: float = 0.95) -> None:
-        super().__init__(parameters, {"lr": lr, "momentum": momentum})
+    def __init__(self, parameters: Iterable[Tensor], lr: float = 0.02) -> None:
+        super().__init__(parameters, {"lr": lr})
         if any(value.ndim != 2 for group in self.param_groups for value in group["params"]):
             raise ValueError("parameters: expected matrices, got a tensor of another number of dimensions")
 
@@ -63,10 +63,10 @@ class Muon(Optimizer):
             moved = [value for value in group["params"] if value.grad is not None]
             for value in moved:
                 momentum = self.state[value].setdefault("momentum", torch.zeros_like(value))
-                momentum.lerp_(value.grad, 1 - group["momentum"])
+                momentum.lerp_(value.grad, 1 - MOMENTUM)
             # on a CPU, one thread per matrix is faster for small products than all threads for each
             run = parallel_map if all(value.device.type == "cpu" for value in moved) else map
-            ahead = [value.grad.lerp(self.state[value]["momentum"], group["momentum"]) for value in moved]
+            ahead = [value.grad.lerp(self.state[value]["momentum"], MOMENTUM) for value in moved]
             for value, direction in zip(moved, run(orthogonalise, ahead), strict=True):
                 value.add_(direction, alpha=-group["lr"] * max(1, value.shape[0] / value.shape[1]) ** 0.5)
 

@@ -84,12 +84,11 @@ class Separated:
         return replace(views, images=views.images * masks + (1 - masks), masks=masks)
 
 
-def separate_background(views: Views, *, seed: int = 0, on_step: Callable[[int, int], None] | None = None) -> Separated:
+def separate_background(views: Views, *, on_step: Callable[[int, int], None] | None = None) -> Separated:
     """Fits the object within the bounds of some views, and its background.
 
     Args:
         views: photographs without masks, and without lens distortion.
-        seed: of rays and samples.
         on_step: called with the number of steps done and the total.
 
     Raises:
@@ -99,7 +98,7 @@ def separate_background(views: Views, *, seed: int = 0, on_step: Callable[[int, 
         found = f"{len(views)}" + (" with lens distortion" if isinstance(views.cameras, DistortedCamera) else "")
         raise ValueError(f"views: expected at least {FEWEST_VIEWS} without lens distortion, got {found}")
     views = replace(views.to("cpu", torch.float32), masks=None)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     inner, outer = (torch.zeros(4, 8, 8, 8) for _ in range(2))
     inner[0] = outer[0] = THIN
     done, total = 0, sum(level[-1] for level in LEVELS)

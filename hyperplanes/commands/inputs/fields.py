@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from hyperplanes.commands.output.writing import keep_if_possible
 from hyperplanes.utilities.messages.formatting import counted, format_duration
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.commands.output.console import Bar, Console
-    from hyperplanes.configuration.fine_tuning import FineTuning
+    from hyperplanes.configuration.fine_tuning import FineTuning, Steps
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.fields.baked import BakedField
     from hyperplanes.rendering.renderer import Sampler
@@ -96,7 +96,7 @@ def adapt_to(
     name: str,
     console: Console,
     *,
-    steps: int | Literal["auto"] = 0,
+    steps: Steps = 0,
     settings: FineTuning | None = None,
 ) -> tuple[AdaptedField | BakedScene, Sequence[str]]:
     """The field of one object. It prints how the field was made, and warns if its pictures may be bad.

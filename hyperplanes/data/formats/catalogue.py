@@ -9,12 +9,9 @@ from typing import Any
 
 from hyperplanes.data.formats.scenes.transforms_json import read_transforms_task
 from hyperplanes.data.pictures.posed import PosedTask
-from hyperplanes.utilities.files.reading import LONGEST_NAME, DataError
+from hyperplanes.utilities.files.reading import LONGEST_NAME, MANIFEST, DataError
 
-__all__ = ["FORMAT", "SPLITS", "Catalogue", "is_plain", "native"]
-
-FORMAT = "hyperplanes-dataset"
-"""The value of "format" in a native manifest.json."""
+__all__ = ["SPLITS", "Catalogue", "is_plain", "native"]
 
 SPLITS = ("train", "val", "test")
 
@@ -48,7 +45,7 @@ def native(folder: Path, manifest: dict[str, Any]) -> Catalogue:
     Raises:
         DataError: a manifest of another version, or splits that are not lists of plain names.
     """
-    source = folder / "manifest.json"
+    source = folder / MANIFEST
     if manifest.get("version") != 1:
         raise DataError(source, "version 1", repr(manifest.get("version")), "read it with the release that wrote it")
     splits = manifest_splits(source, manifest)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyperplanes.data.formats.apps import metashape, polycam, realitycapture, record3d
-from hyperplanes.data.formats.catalogue import FORMAT, Catalogue, native
+from hyperplanes.data.formats.catalogue import Catalogue, native
 from hyperplanes.data.formats.collections import co3d, nmr, npz, objaverse, srn
 from hyperplanes.data.formats.scenes import colmap, idr, llff, nsvf
 from hyperplanes.data.formats.scenes.transforms_json import find_transforms, read_transforms, read_transforms_task
@@ -15,7 +15,7 @@ from hyperplanes.data.formats.unposed import refuse_unposed
 from hyperplanes.data.pictures.frames import Listing, assemble
 from hyperplanes.data.pictures.posed import Posed, PosedTask
 from hyperplanes.utilities.entry_points import load_entries
-from hyperplanes.utilities.files.reading import DataError, read_json
+from hyperplanes.utilities.files.reading import DATA_SET, MANIFEST, DataError, read_json
 
 __all__ = [
     "LAYOUTS",
@@ -119,8 +119,8 @@ def _find_catalogue(path: Path, legacy: bool) -> Catalogue:
     if not path.is_dir():
         refuse_unposed(path)
         raise DataError(path, "the folder of a data set", "nothing", "check the path, or run hyperplanes generate")
-    manifest = read_json(path / "manifest.json") if (path / "manifest.json").is_file() else {}
-    if manifest.get("format") == FORMAT and manifest.get("layout", "native") == "native":
+    manifest = read_json(path / MANIFEST) if (path / MANIFEST).is_file() else {}
+    if manifest.get("format") == DATA_SET and manifest.get("layout", "native") == "native":
         return native(path, manifest)
     if nsvf.is_nsvf(path):
         return _one_scene(path)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from hyperplanes.data.dataset import Dataset
+from hyperplanes.data.formats.catalogue import SPLITS
 from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_masks, check_poses, check_splits
 from hyperplanes.data.inspection.conventions import Conventions, check_conventions
 from hyperplanes.geometry import cameras as camera
@@ -140,7 +141,7 @@ def describe(path: str | Path | Dataset, objects: int = 8) -> Description:
                 found.append(_object(data, name))
         except DataError as error:
             broken.append((name, str(error)))
-    splits = {split: len(data.names(split)) for split in ("train", "val", "test")}
+    splits = {split: len(data.names(split)) for split in SPLITS}
     stated = data.manifest.get("skipped", [])
     skipped = tuple(
         (str(one.get("name")), str(one.get("reason")))

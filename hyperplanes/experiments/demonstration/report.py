@@ -37,6 +37,7 @@ from hyperplanes.geometry.cameras import resized
 from hyperplanes.methods import describe_method
 from hyperplanes.utilities.files.checkpoints import read_json
 from hyperplanes.utilities.files.encoding import encode_png
+from hyperplanes.utilities.files.reading import MANIFEST
 from hyperplanes.utilities.files.writing import write_json, write_whole
 from hyperplanes.utilities.machine.environment import environment
 from hyperplanes.utilities.messages.formatting import format_duration
@@ -251,7 +252,7 @@ def _how_it_was_made(settings: DemoSettings, folder: Path, runner: Runner) -> li
     """Labels and values on the data, the training, the time and the machine."""
     where, trained = environment(), settings.objects - settings.held_out
     steps = read_json(folder / "hyperplanes" / "training.json")["step"]
-    manifest = read_json(runner.data.folder(settings.class_name) / "manifest.json")
+    manifest = read_json(runner.data.folder(settings.class_name) / MANIFEST)
     times = {name: runner.workspace.record.seconds(name) for name in ("data", *MODELS)}
     times["data"] += runner.workspace.record.seconds("unseen")
     count = 1 if runner.workers is None else runner.workers.count

@@ -11,6 +11,7 @@ from hyperplanes.hypernetwork.synchronisation import gather_objects
 __all__ = ["RunningStandardisation"]
 
 EPSILON = 1e-5  # added to the variance
+MOMENTUM = 0.05  # weight of the newest step in the statistics; the first 1 / MOMENTUM steps have equal weights
 
 
 class RunningStandardisation(nn.Module):
@@ -25,16 +26,14 @@ class RunningStandardisation(nn.Module):
 
     Args:
         shape: of the codes of one object.
-        momentum: weight of the newest step in the statistics; the first 1 / momentum steps have equal weights.
     """
 
     mean: Tensor
     variance: Tensor
     steps: Tensor
 
-    def __init__(self, shape: tuple[int, ...], momentum: float = 0.05) -> None:
+    def __init__(self, shape: tuple[int, ...]) -> None:
         super().__init__()
-        self.momentum = momentum
         self.register_buffer("mean", torch.zeros(shape))
         self.register_buffer("variance", torch.ones(shape))
         self.register_buffer("steps", torch.zeros(()))
@@ -63,7 +62,7 @@ class RunningStandardisation(nn.Module):
     @torch.no_grad()
     def _update(self, codes: Tensor) -> None:
         self.steps += 1
-        weight = torch.clamp_min(1 / self.steps, self.momentum)
+        weight = torch.clamp_min(1 / self.steps, MOMENTUM)
         if self.steps == 1:
             self.mean.copy_(codes.mean(0))
             if len(codes) > 1:

@@ -7,7 +7,7 @@ its interval; `weights` are the compositing weights of the intervals, (ray, inte
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -38,19 +38,12 @@ class Hierarchical:
     fine: Annotated[int, range(16385)] = 128
     placement: Literal["intervals", "samples"] = "intervals"
 
+    near_far: ClassVar[str] = "constant"  # one near and far for all rays of a camera, as in NeRF
+    needs_occupancy: ClassVar[bool] = False  # empty space is sampled too
+
     def __post_init__(self) -> None:
         if self.placement == "samples" and self.fine and self.coarse < 3:
             raise ValueError(f"coarse: expected at least 3 samples to draw fine ones between, got {self.coarse}")
-
-    @property
-    def near_far(self) -> str:
-        """One near and far for all rays of a camera, as in NeRF."""
-        return "constant"
-
-    @property
-    def needs_occupancy(self) -> bool:
-        """No: empty space is sampled too."""
-        return False
 
     def for_rendering(self, pixels: float) -> Hierarchical:
         """The same samples as in training."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import torch
@@ -46,19 +46,12 @@ class RayMarching:
     steps: Annotated[int, range(1, MOST_STEPS + 1)] = 96
     stop: float = 5e-3
 
+    near_far: ClassVar[str] = "sphere"  # at the intersections with the scene's sphere
+    needs_occupancy: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         if not 0 <= self.stop < 1:
             raise ValueError(f"stop: expected a transmittance from 0 to below 1, got {self.stop}")
-
-    @property
-    def near_far(self) -> str:
-        """Near and far at the intersections with the scene's sphere."""
-        return "sphere"
-
-    @property
-    def needs_occupancy(self) -> bool:
-        """Yes."""
-        return True
 
     def for_rendering(self, pixels: float) -> RayMarching:
         """More samples than in training, where they are jittered; rays end sooner, and are then opaque.

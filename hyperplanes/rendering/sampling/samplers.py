@@ -6,7 +6,7 @@ Samples come in two layouts, `DenseSamples` (the same number on every ray) and `
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -58,17 +58,15 @@ class OpaqueSamples(PackedSamples):
 
 @runtime_checkable
 class Sampler(Protocol):
-    """A sampling scheme, for training and rendering."""
+    """A sampling scheme, for training and rendering.
 
-    @property
-    def near_far(self) -> str:
-        """How near and far of the rays are chosen, as in `geometry.cast`."""
-        ...
+    Attributes:
+        near_far: how near and far of the rays are chosen, as in `geometry.cast`.
+        needs_occupancy: whether samples are placed with an occupancy grid.
+    """
 
-    @property
-    def needs_occupancy(self) -> bool:
-        """Whether samples are placed with an occupancy grid."""
-        ...
+    near_far: ClassVar[str]
+    needs_occupancy: ClassVar[bool]
 
     @property
     def stop(self) -> float:

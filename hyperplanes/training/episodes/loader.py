@@ -93,8 +93,8 @@ class EpisodeLoader:
 
     def batch(self, step: int) -> Batch:
         """The prepared objects of a step; steps begin at 0. Objects that no thread has prepared are prepared here."""
-        names = self.names_of(step)
-        draws = [Draw(name, self.get(name), self._generator(step, place)) for place, name in self._own(names)]
+        names, seed = self.names_of(step), self.config.seed
+        draws = [Draw(name, self.get(name), object_generator(seed, step, place)) for place, name in self._own(names)]
         count = self.config.tasks // self.processes.count
         return Batch(names, draws[:count], draws[count:])
 
@@ -133,9 +133,6 @@ class EpisodeLoader:
         if self.classes:
             return draw_balanced(self.classes, count, generator)
         return draw(self.names, count, generator)
-
-    def _generator(self, step: int, place: int) -> torch.Generator:
-        return object_generator(self.config.seed, step, place)
 
     def _numbered(self, number: int) -> str:
         """The name of an episode: the name of its object, #, and its number."""

@@ -25,10 +25,6 @@ GRACE = 5.0
 """Seconds that the processes started here have to end by themselves after an error in this process."""
 
 
-def _by_torchrun() -> bool:
-    return distributed.is_available() and distributed.is_torchelastic_launched()
-
-
 def count_processes(devices: int, nodes: int) -> tuple[int, int]:
     """The number of processes per node and the number of nodes. If torchrun started this process, it decides both.
 
@@ -46,7 +42,7 @@ def count_processes(devices: int, nodes: int) -> tuple[int, int]:
     for name, count in (("--devices", devices), ("--nodes", nodes)):
         if count < 1:
             raise ValueError(f"{name}: expected at least 1, got {count}")
-    if _by_torchrun():
+    if distributed.is_available() and distributed.is_torchelastic_launched():
         local, total = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
         if (devices, nodes) not in ((1, 1), (local, total // local)):
             raise ValueError(

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "DATA_SET",
+    "MANIFEST",
     "DataError",
     "check_link",
     "check_regular",
@@ -28,6 +30,9 @@ __all__ = [
     "read_json",
     "read_text",
 ]
+
+MANIFEST, DATA_SET = "manifest.json", "hyperplanes-dataset"
+"""The file that describes a data set, and the value of "format" in it."""
 
 LARGEST_JSON = 256 * 2**20
 """Largest JSON file that is read, in bytes."""
@@ -152,7 +157,7 @@ def folder_checksum(folder: str | Path, but: str | Path | None = None) -> str:
         Ten hexadecimal digits; those of an empty folder if it does not exist.
     """
     root = Path(folder).resolve()
-    manifest = root / "manifest.json"
+    manifest = root / MANIFEST
     stated = hashlib.sha256(read_bytes(manifest)).hexdigest() if manifest.is_file() else ""
     seen = {str(root)} | ({os.path.realpath(but)} if but is not None else set())
     files: list[tuple[str, int, int]] = []

@@ -31,12 +31,6 @@ class LRUCache(Generic[Value]):
         self.nbytes = 0
         self._values: OrderedDict[str, Value] = OrderedDict()
 
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._values
-
     def get(self, name: str) -> Value | None:
         """The value of that name, if still stored."""
         if name in self._values:

@@ -10,18 +10,16 @@ import numpy.typing as npt
 
 from hyperplanes.data.formats.arrays import read_arrays
 from hyperplanes.data.formats.catalogue import SPLITS, Catalogue, is_plain
+from hyperplanes.data.formats.collections import AUTHORS_FOCAL
 from hyperplanes.data.formats.scenes.transforms_document import opencv_from_opengl
 from hyperplanes.data.formats.scenes.transforms_json import read_transforms, read_transforms_task
 from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.frames import assemble
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.files.reading import DataError, read_json
+from hyperplanes.utilities.files.reading import MANIFEST, DataError, read_json
 
-__all__ = ["AUTHORS_FOCAL", "LEGACY", "catalogue", "read_npz"]
-
-AUTHORS_FOCAL = 277.77
-"""Focal length in pixels of the authors' 200x200 images: Blender's 50 mm on a sensor width of 36 mm."""
+__all__ = ["LEGACY", "catalogue", "read_npz"]
 
 LEGACY = ("learnit-128", "hyperplanes-200")
 """The layouts whose published code places principal points at W / 2 at integer pixel centres."""
@@ -97,7 +95,7 @@ def catalogue(folder: Path, manifest: dict[str, Any], *, legacy: bool = False) -
     Returns:
         The catalogue; None for another layout.
     """
-    bounds = stated_bounds(manifest, folder / "manifest.json")
+    bounds = stated_bounds(manifest, folder / MANIFEST)
     archives = sorted(folder.glob("*/sampled/*.npz")) or sorted(folder.glob("sampled/*.npz"))
     if archives:
         return _authors(folder, archives, manifest, bounds, legacy)
@@ -123,7 +121,7 @@ def _authors(
             names = [str(name).replace("_", "-") for name in manifest["splits"].get(split, [])]
             splits[split] = tuple(name for name in names if name in paths)
             if missing := [name for name in names if name not in paths]:
-                skipped.append(f"{folder / 'manifest.json'}: skipped {len(missing)} of {len(names)} objects of {split} "
+                skipped.append(f"{folder / MANIFEST}: skipped {len(missing)} of {len(names)} objects of {split} "
                                f"without an archive, as {missing[0]}")  # fmt: skip
     else:
         for home in sorted({path.parent for path in archives}):

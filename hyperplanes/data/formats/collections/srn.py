@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hyperplanes.data.formats.catalogue import Catalogue
+from hyperplanes.data.formats.catalogue import SPLITS, Catalogue
 from hyperplanes.data.formats.text_numbers import read_numbers, read_rows
 from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.frames import scaled_matrix
@@ -16,7 +16,7 @@ from hyperplanes.data.pictures.images import image_size, read_image
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.axes import invert_poses
-from hyperplanes.utilities.files.reading import DataError, list_files, malformed
+from hyperplanes.utilities.files.reading import MANIFEST, DataError, list_files, malformed
 
 __all__ = ["catalogue", "is_srn", "read_srn"]
 
@@ -83,7 +83,7 @@ def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
     if is_srn(folder):
         homes = {"test": [folder]}
     else:
-        homes = {split: [] for split in ("train", "val", "test")}
+        homes = {split: [] for split in SPLITS}
         for child in sorted(path for path in folder.iterdir() if path.is_dir()):
             split = child.name.rpartition("_")[2]
             if split in homes:
@@ -94,8 +94,8 @@ def catalogue(folder: Path, manifest: dict[str, Any]) -> Catalogue | None:
     if not any(homes.values()):
         return None
     paths = {path.name: path for found in homes.values() for path in found}
-    splits = {split: tuple(path.name for path in homes.get(split, [])) for split in ("train", "val", "test")}
-    bounds = stated_bounds(manifest, folder / "manifest.json")
+    splits = {split: tuple(path.name for path in homes.get(split, [])) for split in SPLITS}
+    bounds = stated_bounds(manifest, folder / MANIFEST)
 
     def read(name: str) -> PosedTask:
         return PosedTask.alternating(read_srn(paths[name], folder, bounds), name)
