@@ -128,7 +128,9 @@ def source_of(arguments: Arguments) -> Procedural | MeshFolder:
     if arguments.split_file is not None:
         raise ValueError("split_file: expected with --meshes and a ShapeNetCore tree, found with --class")
     if arguments.meshes_class is not None or arguments.up_of or arguments.up != "y":
-        raise ValueError("class_name, up, up_of: expected with --meshes, found with --class")
+        given = {"--class-name": arguments.meshes_class, "--up-of": arguments.up_of, "--up": arguments.up != "y"}
+        named = ", ".join(option for option, value in given.items() if value)
+        raise ValueError(f"{named}: expected with --meshes, found with --class; leave it out")
     name = str(arguments.class_name)
     check_class(name)
     return Procedural(name, COUNT if arguments.count is None else arguments.count, arguments.seed)

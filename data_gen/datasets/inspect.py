@@ -85,7 +85,8 @@ def inspect(path: str | Path, out: str | Path, objects: int = _OBJECTS, *, check
         sparse = _sparse(locate_scene(path), data.posed(names[0])) if len(data) == 1 else None
         drawings["cameras.png"] = _cameras(views, support, names[0], sparse)
         if len(data) == 1 and len(views) > 1:
-            report = describe_scene(views, sparse)
+            contradicted = not description.objects[0].conventions.consistent
+            report = replace(describe_scene(views, sparse), contradicted=contradicted)
             scene = [*report.lines(), *_trial(views)]
             drawings["coverage.png"] = draw_coverage(report, views)
         for name, drawing in drawings.items():

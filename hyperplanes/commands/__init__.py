@@ -55,7 +55,7 @@ EXAMPLES = """\
   hyperplanes generate --class car --count 70 --resolution 64 --seed 0 --out data/cars
   hyperplanes train --data data/cars --preset quick --out runs/cars
   hyperplanes capture photos/ --out scene
-  hyperplanes render --checkpoint runs/cars --views scene --out new-views/"""
+  hyperplanes render --checkpoint small --views scene --out new-views/"""
 
 
 def find_verbs() -> dict[str, Verb]:

@@ -4,7 +4,7 @@ The result is a checkpoint without a hypernetwork. `render` and `export` take it
 with the same images, because the field reads its colours from them.
 
 Example:
-    hyperplanes adapt --checkpoint runs/demo --views scene --out chair-weights --steps 100
+    hyperplanes adapt --checkpoint small --views scene --out chair-weights --steps 100
     hyperplanes render --checkpoint chair-weights --views scene --out new-views
 """
 

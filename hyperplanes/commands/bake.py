@@ -5,8 +5,8 @@ fitted to the support views, which recovers what baking loses, and more. To show
 the baked pictures and of the field's own pictures on the query views.
 
 Example:
-    hyperplanes bake --checkpoint runs/demo --views scene --out chair.safetensors
-    hyperplanes bake --checkpoint runs/demo --views scene --out chair.safetensors --voxels 384 --orbit 96
+    hyperplanes bake --checkpoint small --views scene --out chair.safetensors
+    hyperplanes bake --checkpoint small --views scene --out chair.safetensors --voxels 384 --orbit 96
 """
 
 from __future__ import annotations

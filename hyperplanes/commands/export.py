@@ -5,8 +5,8 @@ texture, which Blender, Windows, slide shows and three.js open. The page is one 
 any other file. It draws baked voxels, and the mouse or a finger turns them.
 
 Example:
-    hyperplanes export --checkpoint runs/demo --views scene --out chair
-    hyperplanes export --checkpoint runs/demo --views scene --out chair --what mesh --voxels 192
+    hyperplanes export --checkpoint small --views scene --out chair
+    hyperplanes export --checkpoint small --views scene --out chair --what mesh --voxels 192
     hyperplanes export --checkpoint small --views scene --out chair --what page --all-views
 """
 

@@ -8,8 +8,8 @@ nerfstudio's viewer.
 
 Example:
     hyperplanes render --checkpoint small --views example-car --out new-views
-    hyperplanes render --checkpoint runs/demo --views scene --out new-views
-    hyperplanes render --checkpoint runs/demo --views scene --out new-views --orbit 48 --all-views
+    hyperplanes render --checkpoint small --views scene --out new-views
+    hyperplanes render --checkpoint small --views scene --out new-views --orbit 48 --all-views
     hyperplanes render --checkpoint small --views scene --out video --camera-path camera_path.json --turntable mp4
     hyperplanes render --checkpoint small --views scene --out geometry --rendered-output-names rgb depth normals
 """
@@ -182,7 +182,7 @@ def run(arguments: Arguments) -> int:
         console.warn(f"{task.name}: {line}")
     if older := sorted({path.name for path in arguments.out.glob("*.png")} - {path.name for path in paths}):
         console.warn(f"{arguments.out}: pictures that this command did not write are there: {listed(older)}")
-    how = " corrected by residuals" if corrected else ""
+    how = " (colours corrected by residuals)" if corrected else ""
     console.say(f"{arguments.out}: {counted(len(paths), 'picture')}{how}, {format_duration(seconds)} a view")
     return 0
 

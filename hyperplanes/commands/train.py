@@ -58,6 +58,7 @@ __all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 
 
 BROUGHT = {"Fields": "hyperplanes.fields"}
+"""Groups of entry points whose names are fields and methods, by their heading in the help."""
 
 SAME = {
     "steps": ("training.steps", "training.epochs"),
@@ -69,7 +70,6 @@ SAME = {
     "protocol": ("model.protocol",),
 }
 """The settings that an option sets, too."""
-"""Groups of entry points whose names are fields and methods, by their heading in the help."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
     unlike, angle = _unlikeness(model, shown)
     if unlike is not None and unlike > UNLIKE:
         found.append(
-            f"the views differ from those of the training: their codes deviate {unlike:.1f} times as much as those did"
+            f"the images differ from those of the training, {unlike:.1f} times as much as those among each other"
             + ("" if steps or len(shown) < 2 else "; --steps 100 adapts to them")
         )
     if angle > ELSEWHERE and len(shown) >= planes:

@@ -1,4 +1,4 @@
-"""Meta-training of theta and the hypernetwork by separate Adam steps on query rays (HyperPlanes, Algorithm 1)."""
+"""Meta-training of theta and the hypernetwork by separate optimiser steps on query rays (HyperPlanes, Algorithm 1)."""
 
 from __future__ import annotations
 

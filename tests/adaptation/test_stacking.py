@@ -104,13 +104,24 @@ def test_pictures_and_pixels_are_the_mean_of_both_fields(share):
     one, other, mixed = (each.render(cameras) for each in (learned, hull, stacked))
     torch.testing.assert_close(mixed.images, torch.lerp(one.images, other.images, share))
     torch.testing.assert_close(mixed.opacity, torch.lerp(one.opacity, other.opacity, share))
+    known = (one.depth > 0) & (other.depth > 0)
     moments = (each.opacity * each.depth for each in (one, other))
-    torch.testing.assert_close(mixed.opacity * mixed.depth, torch.lerp(*moments, share))
+    torch.testing.assert_close((mixed.opacity * mixed.depth)[known], torch.lerp(*moments, share)[known])
     assert mixed.samples == one.samples + other.samples
     view, pixels = torch.zeros(5, dtype=torch.long), torch.rand(5, 2) * 4 + 4
     rays = cast(cameras, view, pixels, learned.occupancy.bounds)
     one, other, mixed = (each.trace(rays, differentiable=False) for each in (learned, hull, stacked))
     torch.testing.assert_close(mixed.colour, torch.lerp(one.colour, other.colour, share))
+
+
+def test_a_pixel_without_depth_in_one_picture_has_that_of_the_other():
+    """The hull has no depth where the middle of a pixel misses it, but may have opacity there, by the pixel's rays."""
+    learned, hull = both(ball_views(ring(6, (24, 24))))
+    one = learned.render(ring(2, (10, 13), shift=1))
+    without = replace(one, depth=torch.zeros_like(one.depth))
+    found = stack(learned, hull, 0.4)._mean(one, without).depth
+    assert one.depth.max() > 0
+    torch.testing.assert_close(found, one.depth * (one.opacity > 0))
 
 
 def test_two_threads_make_the_pictures_of_one():

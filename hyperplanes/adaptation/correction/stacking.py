@@ -104,10 +104,12 @@ class StackedField(AdaptedField):
         return (None, sampling) if self.overruled else (sampling, None)
 
     def _mean(self, own: Pixels, other: Pixels) -> Pixels:
-        """Averages colours and opacities, and depths weighted by opacity."""
+        """Averages colours and opacities, and depths weighted by opacity; a depth of 0 is none and does not count."""
         share = self._shares(own, other)
         opacity = torch.lerp(own.opacity, other.opacity, share)
-        depth = torch.lerp(own.opacity * own.depth, other.opacity * other.depth, share) / opacity.clamp_min(1e-10)
+        mine, theirs = (each.opacity * (each.depth > 0) for each in (own, other))
+        depth = torch.lerp(mine * own.depth, theirs * other.depth, share)
+        depth = depth / torch.lerp(mine, theirs, share).clamp_min(1e-10)
         colour, of_colours = ("images", share) if isinstance(own, Pictures) else ("colour", share[:, None])
         colours = torch.lerp(getattr(own, colour), getattr(other, colour), of_colours)
         return replace(own, **{colour: colours}, opacity=opacity, depth=depth, samples=own.samples + other.samples)

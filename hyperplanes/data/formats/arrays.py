@@ -25,7 +25,7 @@ def read_arrays(path: str | Path, names: set[str], root: Path | None = None) -> 
     Args:
         path: the file.
         names: the arrays to read; those that the file lacks are left out.
-        root: as in `files.check_regular`.
+        root: as in `reading.check_regular`.
 
     Returns:
         The arrays by name.

@@ -24,7 +24,7 @@ def read_rows(path: Path, expected: str, root: Path) -> list[list[float]]:
     Args:
         path: the file.
         expected: what it should hold, for the message.
-        root: as in `files.check_regular`.
+        root: as in `reading.check_regular`.
 
     Returns:
         The numbers, which may be infinite or NaN.

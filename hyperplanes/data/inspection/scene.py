@@ -78,6 +78,7 @@ class SceneReport:
         sparse: points of a reconstruction, or None.
         masked: whether the views have masks.
         inverted: how many of these seem to show the background.
+        contradicted: whether pictures and poses contradict each other (`conventions.check_conventions`).
     """
 
     views: tuple[ViewReport, ...]
@@ -90,6 +91,7 @@ class SceneReport:
     sparse: SparsePoints | None = None
     masked: bool = True
     inverted: int = 0
+    contradicted: bool = False
 
     @property
     def worst(self) -> list[ViewReport]:
@@ -142,6 +144,8 @@ class SceneReport:
                 f"poor pictures: {self.inverted} of {len(self.views)} masks seem to show the background; invert them, "
                 "white is the object"
             )
+        if self.contradicted:
+            return "poor pictures: poses and images contradict each other; see the conventions above"
         unseen = [side for side, share in (("above", self.above), ("below", self.below)) if share < 0.25]
         if self.covered < 0.25:
             text = "good pictures only from near where the views stand; other sides are guessed"

@@ -95,7 +95,7 @@ def cut_off(
     """Which masks reach the border of their image.
 
     A single pixel that is hardly opaque suffices, because a view that counts as showing the object whole limits the
-    sphere. `geometry.visibility.planes.margins`, which is for the blending weights of colours, tolerates a few pixels.
+    sphere. `visibility.penalties.margins`, which is for the blending weights of colours, tolerates a few pixels.
     """
     opaque = masks[:, 0] > 0
     sides = [opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]]

@@ -19,7 +19,7 @@ def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path) ->
     Args:
         folders: which may hold masks; the first one that exists is used.
         pictures: the image files, some of which may be missing.
-        root: as in `files.check_regular`.
+        root: as in `reading.check_regular`.
 
     Returns:
         A file for each image; None for a missing image, and for all images if none of the folders exists.

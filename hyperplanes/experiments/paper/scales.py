@@ -43,7 +43,7 @@ class Scale:
         shown: the numbers of support views of the rows that are kept; None for all of them.
         packaged: whether to keep the rows of packaged models.
         data: by class, changed options of `generate`, and as `contents` the checksum of a folder that it reads, by
-            `files.folder_checksum`.
+            `reading.folder_checksum`.
     """
 
     name: str

@@ -1,1 +1,1 @@
-"""Fused kernels of lookup, sampling and carving: numba on the CPU, Triton on CUDA, and their PyTorch operators."""
+"""Fused kernels: lookup and sampling, visual hulls, visibility, voxels and layers; numba on the CPU, Triton on CUDA."""

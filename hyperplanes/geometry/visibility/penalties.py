@@ -43,7 +43,7 @@ class Against:
         coordinates: Float[Tensor, "point view 2"],
         size: Sequence[int],
     ) -> Float[Tensor, "point view"]:
-        """The penalty of each view that shows a point; the kernel `visibility.choose` computes the same.
+        """The penalty of each view that shows a point; the kernel `choosing.choose` computes the same.
 
         Args:
             behind: depth of the point behind the surface that the view sees, less the tolerance, in radii.

@@ -84,6 +84,7 @@ def test_poses_of_wrong_conventions_are_recognised_and_named(tmp_path, change, n
     found = inspect(write(tmp_path / "ball", change), tmp_path / "out")
     assert found.has_problems
     assert found.description.objects[0].conventions.best == name
+    assert not any(line.startswith("expect: good") for line in found.lines())
     assert f"if the poses are {name}" in "\n".join(found.lines())
 
 

@@ -60,7 +60,7 @@ def _judge(inside, cameras, view, maps, shape, x, y, bottom, voxel, min_z, opaci
 def centres(cameras, maps, shape, corner, voxel, limits, occupied, start, stop):
     """Clears the voxels in layers start..stop of `occupied` whose centre some view shows with too little opacity.
 
-    `cameras` and `maps` are those of `visibility.choose`, `shape` the number of views, height, width and the pitch of
+    `cameras` and `maps` are those of `choosing.choose`, `shape` the number of views, height, width and the pitch of
     `cameras`; `limits` are min_z and the opacity, `corner` is where voxel (0, 0, 0) starts.
     """
     inside, half, last = np.empty(LANES, corner.dtype), corner.dtype.type(0.5), 0

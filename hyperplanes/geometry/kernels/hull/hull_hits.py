@@ -16,7 +16,7 @@ __all__ = ["hull_hits"]
 @inlined
 @no_type_check
 def _opacity(cameras, pitch, view, x, y, z, maps, shape, min_z):
-    """Bilinear opacity of a view's mask at a point's projection, as in `visibility.judge`; 1 where it is not shown."""
+    """Bilinear opacity of a view's mask at a point's projection, as in `choosing.judge`; 1 where it is not shown."""
     number = maps.dtype.type
     zero, one = number(0), number(1)
     height, width = shape[1], shape[2]
@@ -50,7 +50,7 @@ def hull_hits(
 
     Samples lie at first + i step, before far, in occupied voxels, as in `marching.march`. One lies in the hull where
     every view that shows it has the least opacity there; the view that ruled out the last sample is tested first.
-    `cameras` and `maps` are those of `visibility.choose`, `shape` the number of views, height, width and the pitch of
+    `cameras` and `maps` are those of `choosing.choose`, `shape` the number of views, height, width and the pitch of
     `cameras`; `limits` are min_z and the opacity, `sphere` the centre and the radius of the scene, `box` the corners
     around its occupied voxels.
     """

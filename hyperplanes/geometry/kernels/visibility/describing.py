@@ -1,6 +1,6 @@
 """The CPU kernel of `visibility.VisibilityPlanes.describe`: what views show of a point, as rows for a network.
 
-Views are chosen as by `visibility.choose`; colours are read only in the chosen ones. Rows have the order of the inputs
+Views are chosen as by `choosing.choose`; colours are read only in the chosen ones. Rows have the order of the inputs
 of the first layer, so that nothing is gathered or concatenated afterwards.
 """
 
@@ -219,8 +219,8 @@ def describe(
 
     `shape` is the number of views, height, width, the numbers of best and nearest views in a row, the pitch of
     `cameras`, the bits of a packed channel, and the frequencies of points and directions; `numbers` are the limits of
-    `visibility.choose`, then FADING, FALLOFF and SMALLEST_ANGLE; `sphere` the centre and 1 / radius of the scene. The
-    others are as in `visibility.choose`.
+    `choosing.choose`, then FADING, FALLOFF and SMALLEST_ANGLE; `sphere` the centre and 1 / radius of the scene. The
+    others are as in `choosing.choose`.
     """
     number = numbers.dtype.type
     zero, one = number(0), number(1)
