@@ -698,7 +698,7 @@ def test_pictures_of_many_views_are_corrected_unless_that_is_off(tmp_path, monke
     monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path / "cache"))
     with small_packaged(learned_steps=0):
         assert main(["render", *command, "--out", str(tmp_path / "corrected")]) == 0
-        assert "2 pictures corrected by residuals" in capsys.readouterr().out
+        assert "2 pictures (colours corrected by residuals)" in capsys.readouterr().out
         # without correction no support view is rendered: for pictures, for their estimated PSNR, or for voxels
         monkeypatch.setattr(ResidualField, "_compute", lambda *_: pytest.fail("a support view was rendered"))
         assert main(["render", *command, "--out", str(tmp_path / "plain"), "--residuals", "off"]) == 0

@@ -144,7 +144,7 @@ def main():
 
     hyperplanes.training.start_training = start_later
     hyperplanes.data.dataset.open_datasets = lambda *given, **options: Data(3)
-    given = f"train --data any --out {folder / 'killed'} --devices 2 --steps 6".split()
+    given = f"train --data {folder} --out {folder / 'killed'} --devices 2 --steps 6".split()
     return cli.main([*given, *OPTIONS])
 
 

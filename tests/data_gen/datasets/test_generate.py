@@ -313,7 +313,7 @@ def test_names_that_are_equal_in_the_authors_layout_are_refused(tmp_path):
     ("given", "message"),
     [
         ({"meshes": Path("meshes"), "count": 1}, "count: expected with --class"),
-        ({"class_name": "car", "up": "z"}, "class_name, up, up_of: expected with --meshes"),
+        ({"class_name": "car", "up": "z"}, "--up: expected with --meshes, found with --class; leave it out"),
     ],
 )
 def test_options_of_the_other_source_are_refused(given, message):
