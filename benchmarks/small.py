@@ -1,7 +1,7 @@
 """Compare rendering by the packaged model `small` with plain PyTorch that evaluates every sample.
 
     python -m benchmarks small --json FILE
-    python -m benchmarks small --scene ../shared/posed/chair --views 50
+    python -m benchmarks small --scene SCENE --views 50
 
 The object is a held-out procedural car, or a posed scene. Measured are the time to adapt, the time of a view at several
 sizes, and PSNR. The reference is the same field in PyTorch, which looks up and concatenates the inputs of the network

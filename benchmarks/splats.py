@@ -1,7 +1,7 @@
 """Compare Gaussian splats with the baked voxels that they are made from: PSNR on query views, and time.
 
     python -m benchmarks splats --json FILE
-    python -m benchmarks splats --scene ../shared/posed/chair
+    python -m benchmarks splats --scene SCENE
 
 The objects are held-out procedural objects, or a posed scene. `small` adapts to the support views, 25 for procedural
 objects. Its field is baked, the voxels are fitted, and splats are made from them and fitted, as in `hyperplanes export
