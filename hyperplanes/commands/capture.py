@@ -63,7 +63,8 @@ def run(arguments: Arguments) -> int:
 
     console, started = Console(), time.perf_counter()
     if arguments.frames is not None and arguments.photographs.is_dir():
-        raise ValueError(f"--frames: expected a video, got the folder {arguments.photographs}, of which all are used")
+        found = f"the folder {arguments.photographs}, whose photographs are all used"
+        raise ValueError(f"--frames: expected a video, got {found}; leave it out")
     settings = Settings(arguments.size, arguments.mask, arguments.frames or FRAMES, arguments.order)
     with ExitStack() as stack:
         shown: tuple[str, Bar] | None = None

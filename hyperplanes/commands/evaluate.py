@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -279,11 +280,10 @@ def _check(arguments: Arguments) -> None:
             figure_kind(figure)  # a wrong name is found before anything is evaluated
     for option in OUTPUTS:
         check_output(option, getattr(arguments, option))
-    files = {path.resolve(): f"--{option}" for option in OUTPUTS if (path := getattr(arguments, option)) is not None}
-    for option in OUTPUTS:
-        path = getattr(arguments, option)
-        if path is not None and files[path.resolve()] != f"--{option}":
-            raise ValueError(f"--{option}, {files[path.resolve()]}: expected a file each, got {path} twice; rename one")
+    files = [(option, path) for option in OUTPUTS if (path := getattr(arguments, option)) is not None]
+    for (one, path), (other, same) in combinations(files, 2):
+        if path.resolve() == same.resolve():
+            raise ValueError(f"--{one}, --{other}: expected a file each, got {path} twice; rename one")
     for option in ("seeds", "objects", "support", "query"):
         if (number := getattr(arguments, option)) is not None and number < 1:
             raise ValueError(f"--{option}: expected at least 1, got {number}")

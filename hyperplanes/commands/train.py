@@ -88,8 +88,8 @@ class Arguments:
         field: The target network: nerf, multiplane, point_multiplane, image_based, simplified_nerf, or that of another
             package. By default that of the preset, and for learned initialisations NeRF.
         support: Support views and ImagePlanes per object. If the data set has fewer, query views are added.
-        checkpoint: The initial weights instead of random ones: a checkpoint, or a packaged model such as small. For
-            mv_matched, the checkpoint of mv_meta that it is matched to.
+        checkpoint: The initial weights instead of random ones: a checkpoint, or a packaged model such as small, whose
+            learned steps and gating network are kept. For mv_matched, the checkpoint of mv_meta that it is matched to.
         protocol: How rays are sampled: paper takes 64 + 128 samples on every ray, ray_marching takes samples only in
             occupied space, default is as in the preset.
         steps: Training steps. By default those of the preset.

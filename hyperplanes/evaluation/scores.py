@@ -91,10 +91,10 @@ class Score:
         found = self._numbers(quantity)
         return fmean(found) if found else math.nan
 
-    def spread(self, quantity: str) -> float:
-        """Standard deviation of a number over the objects that have it; NaN for fewer than two, or infinite numbers."""
+    def spread(self, quantity: str) -> float | None:
+        """Standard deviation of a number over the objects that have it; None for fewer than two or infinite numbers."""
         found = self._numbers(quantity)
-        return stdev(found) if len(found) > 1 and all(map(math.isfinite, found)) else math.nan
+        return stdev(found) if len(found) > 1 and all(map(math.isfinite, found)) else None
 
     def _numbers(self, quantity: str) -> list[float]:
         """A number of every object that has it."""

@@ -31,8 +31,8 @@ def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
     """
     table = []
     for score in scores:
-        spread = f"± {score.spread('psnr'):.2f} dB" if len(score.objects) > 1 else "-"
-        row = [score.method, _shown(score, "psnr"), spread]
+        spread = score.spread("psnr")
+        row = [score.method, _shown(score, "psnr"), "-" if spread is None else f"± {spread:.2f} dB"]
         row += [_shown(score, name) for name in COLUMNS if name != "psnr" and _all_have(scores, name)]
         row += [format_duration(score.mean(name)) for name in ("adapt_seconds", "render_seconds")]
         table.append(tuple(row))

@@ -76,4 +76,5 @@ def test_numbers_that_are_not_finite_come_back_from_a_file(tmp_path):
 
 def test_the_spread_is_the_sample_standard_deviation():
     assert score("a", [20.0, 22.0]).spread("psnr") == pytest.approx(np.std([20.0, 22.0], ddof=1))
-    assert math.isnan(score("a", [20.0]).spread("psnr"))
+    assert score("a", [20.0]).spread("psnr") is None
+    assert score("a", [20.0, math.inf]).spread("psnr") is None

@@ -188,6 +188,7 @@ def test_the_page_of_a_demonstration():
     assert any(source.startswith("data:image/webp") for source in parser.sources)
     for name in ("nearest_view", "hull_blend", "hull_blend:chair", "point_multiplane", "hyperplanes", "hyperplanes_1"):
         assert f"<small>{name}</small>" in page
+    assert "nan" not in re.findall(r"[a-z]+", page[page.index("<table") :].split("</table>")[0])  # rows of one object
     assert "arXiv 2402.01524" in page
     assert find_commit() in page
 

@@ -60,7 +60,7 @@ class Row:
         method: the name of the method.
         about: a short description of it.
         psnr: PSNR in dB, mean over objects.
-        deviation: standard deviation of PSNR over objects, in dB.
+        deviation: standard deviation of PSNR over objects, in dB; None for a single one.
         foreground: PSNR in dB inside the true masks, mean over objects; None without masks.
         ssim: SSIM, mean over objects.
         adapt: the time from images to a field, as text.
@@ -70,7 +70,7 @@ class Row:
     method: str
     about: str
     psnr: float
-    deviation: float
+    deviation: float | None
     foreground: float | None
     ssim: float
     adapt: str

@@ -170,9 +170,8 @@ def _seen(
         facing = (offsets / distance[:, None] * outward).sum(-1)
         local = points @ camera.camera_from_world(one)[0, 2, :3] + camera.camera_from_world(one)[0, 2, 3]
         at = one.project(points[None])[0] / last * 2 - 1
-        shown = (local > camera.least_depth(views.cameras)) & at.isfinite().all(
-            -1
-        )  # a lens may not show a point at all
+        # in front of the camera, and not beyond what its lens shows
+        shown = (local > camera.least_depth(views.cameras)) & at.isfinite().all(-1)
         at = torch.where(shown[:, None], at, 2.0)[None, None]
         first, span = grid_sample(maps, at, mode="nearest", align_corners=True)[0, :, 0]
         tolerance = TOLERANCE * pixel * distance / facing.clamp_min(OBLIQUE)
