@@ -362,7 +362,7 @@ def test_a_method_of_another_package_is_made_and_described(other_package):
 def test_names_of_other_packages_are_in_the_help(monkeypatch, capsys):
     brought = {"hyperplanes.methods": ["copycat"], "hyperplanes.fields": ["constant"]}
     points = {group: [EntryPoint(name, "nowhere:nothing", group) for name in names] for group, names in brought.items()}
-    monkeypatch.setattr("hyperplanes.cli.find_entries", lambda group: points.get(group, []))
+    monkeypatch.setattr("hyperplanes.commands.parsing.find_entries", lambda group: points.get(group, []))
     with pytest.raises(SystemExit):
         main(["evaluate", "--help"])
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
