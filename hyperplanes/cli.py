@@ -76,6 +76,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         found = find_verb(verb)
     except ValueError as error:
         return _print_error(f"hyperplanes: {error}")
+    module = None
     try:
         with interruptible():
             from hyperplanes.commands.parsing import parse
@@ -94,7 +95,12 @@ def _main(arguments: Sequence[str] | None) -> int:
     except (ValueError, OSError, MemoryError, RuntimeError) as error:
         if traceback or not (isinstance(error, ValueError | OSError | MissingPackageError) or is_memory(error)):
             raise
-        return _print_error(f"hyperplanes {verb}: {one_line(error)}")
+        message = one_line(error)
+        if module is not None:
+            from hyperplanes.commands.parsing import as_option
+
+            message = as_option(message, module, rest)
+        return _print_error(f"hyperplanes {verb}: {message}")
 
 
 @contextmanager

@@ -142,7 +142,7 @@ def prepare_scene(
         ValueError: if `up` is neither of the two.
     """
     if up not in ("y", "z"):
-        raise ValueError(f"up: expected 'y' or 'z', received {up!r}")
+        raise ValueError(f"up: expected 'y' or 'z', got {up!r}")
     source = source or name
     found = list(warnings)
     _refuse_too_many(scene, source)

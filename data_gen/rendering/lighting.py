@@ -60,14 +60,14 @@ class Lighting:
 
     def __post_init__(self) -> None:
         if len(self.lights) > MAX_LIGHTS:
-            raise ValueError(f"lights: expected at most {MAX_LIGHTS}, received {len(self.lights)}")
+            raise ValueError(f"lights: expected at most {MAX_LIGHTS}, got {len(self.lights)}")
         for light in self.lights:
             length = math.hypot(*light.direction)
             if not abs(length - 1.0) < 1e-6:
-                raise ValueError(f"direction: expected a unit vector, received {light.direction} of length {length:g}")
+                raise ValueError(f"direction: expected a unit vector, got {light.direction} of length {length:g}")
         for colour in (self.sky, self.ground, *(light.colour for light in self.lights)):
             if len(colour) != 3 or not all(math.isfinite(value) and value >= 0.0 for value in colour):
-                raise ValueError(f"colour: expected three numbers from 0 on, received {colour}")
+                raise ValueError(f"colour: expected three numbers from 0 on, got {colour}")
 
     def directions(self, world_from_camera: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Unit vectors towards the lights in world axes.
@@ -108,7 +108,7 @@ def resolve_lighting(lighting: str | Lighting, *, seed: int = 0) -> Lighting:
         return _HEADLIGHT
     if lighting == "random":
         return _random(seed)
-    raise ValueError(f"lighting: expected one of {', '.join(LIGHTING_PRESETS)} or a Lighting, received {lighting!r}")
+    raise ValueError(f"lighting: expected one of {', '.join(LIGHTING_PRESETS)} or a Lighting, got {lighting!r}")
 
 
 def _direction(azimuth: float, elevation: float) -> Vector:

@@ -88,7 +88,7 @@ class MeshRenderer:
 
     def __init__(self, renderer: str | None = None, supersample: int = SUPERSAMPLE) -> None:
         if not 1 <= supersample <= MAX_SUPERSAMPLE:
-            raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, received {supersample}")
+            raise ValueError(f"supersample: expected 1 to {MAX_SUPERSAMPLE}, got {supersample}")
         self.name = renderer or find_renderer().name
         self.supersample = supersample
         self._renderer = _make_renderer(self.name)
@@ -123,9 +123,7 @@ class MeshRenderer:
         """
         unknown = sorted(set(channels) - set(CHANNELS))
         if unknown or not channels:
-            raise ValueError(
-                f"channels: expected some of {', '.join(CHANNELS)}, received {', '.join(channels) or 'none'}"
-            )
+            raise ValueError(f"channels: expected some of {', '.join(CHANNELS)}, got {', '.join(channels) or 'none'}")
         lights = resolve_lighting(lighting, seed=seed)
         surfaces = shaded_surfaces(parts, name)
         pictures: dict[str, npt.NDArray] = {}
@@ -148,7 +146,7 @@ class MeshRenderer:
 
 def _make_renderer(name: str) -> ViewRenderer:
     if name not in RENDERERS:
-        raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}")
+        raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, got {name!r}")
     try:
         if name == "embree":
             from data_gen.rendering.ray_tracing.embree import EmbreeRenderer

@@ -38,7 +38,7 @@ def draw_test_image(name: str) -> str:
     red = (left[..., 3] == 255) & (left[..., 0] > 40) & (left[..., 0] > 2 * left[..., 1])
     if not red.all() or right[..., 3].any():
         raise RendererError(
-            f"expected a red left half, received {left[8, 4].tolist()} there, and alpha {right[..., 3].max()} outside"
+            f"expected a red left half, got {left[8, 4].tolist()} there, and alpha {right[..., 3].max()} outside"
         )
     return renderer.detail
 

@@ -84,7 +84,7 @@ def probe(name: str) -> ProbeResult:
         ValueError: if the name is unknown.
     """
     if name not in RENDERERS:
-        raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, received {name!r}")
+        raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, got {name!r}")
     if name not in _cache:
         _cache[name] = _run_probe(name)
     return _cache[name]

@@ -141,7 +141,7 @@ def shaded_surfaces(parts: Sequence[trimesh.Trimesh], name: str = "object") -> l
         if len(mesh.faces):
             surfaces.append(_surface(mesh, f"{name}, part {number}", images))
     if not surfaces:
-        raise RenderError(f"{name}: expected at least one face, received {len(parts)} parts without any")
+        raise RenderError(f"{name}: expected at least one face, got {len(parts)} parts without any")
     return _one_side_where_doubled(surfaces)
 
 
@@ -187,7 +187,7 @@ def _surface(mesh: trimesh.Trimesh, where: str, images: dict[Any, Any]) -> Shade
     finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(vertices).all(axis=1))
     if not finite[faces].all():
         bad = int((~finite[faces]).any(axis=1).sum())
-        raise RenderError(f"{where}: expected finite vertices, received {bad} faces on NaN or infinity")
+        raise RenderError(f"{where}: expected finite vertices, got {bad} faces on NaN or infinity")
     positions = np.where(finite[:, None], vertices, 0.0)
     visual, texture = visual_of(mesh), texture_of(mesh)
     kind = visual.kind if visual.defined else None
@@ -249,7 +249,7 @@ def _texture_coordinates(
     if given is None or len(given) != len(mesh.vertices):
         found = "none" if given is None else str(len(given))
         raise RenderError(
-            f"{where}: expected texture coordinates for its {len(mesh.vertices)} textured vertices, received {found}"
+            f"{where}: expected texture coordinates for its {len(mesh.vertices)} textured vertices, got {found}"
         )
     uv = np.asarray(given, dtype=np.float64)[:, :2]
     other = None if texture is None else texture.vertex_attributes.get(EMISSIVE_UV)
@@ -265,7 +265,7 @@ def _material(material: Any, images: dict[Any, Any], where: str) -> dict[str, An
     if material is None:
         material = PBRMaterial(baseColorFactor=_PLAIN)
     if not isinstance(material, PBRMaterial):
-        raise RenderError(f"{where}: expected a PBRMaterial or a SimpleMaterial, received {type(material).__name__}")
+        raise RenderError(f"{where}: expected a PBRMaterial or a SimpleMaterial, got {type(material).__name__}")
     factor = linear_factor(material)
     base = np.ones(4) if factor is None else factor
     texture = _texels(material.baseColorTexture, images, keep_alpha=material.alphaMode in {"BLEND", "MASK"})

@@ -62,24 +62,24 @@ class Rig:
     def __post_init__(self) -> None:
         poses = np.ascontiguousarray(self.world_from_camera, dtype=np.float64)
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
-            raise ValueError(f"world_from_camera: expected shape (view, 4, 4) with view >= 1, received {poses.shape}")
+            raise ValueError(f"world_from_camera: expected shape (view, 4, 4) with view >= 1, got {poses.shape}")
         intrinsics = np.asarray(self.intrinsics, dtype=np.float64)
         if intrinsics.shape not in {(3, 3), (len(poses), 3, 3)}:
-            raise ValueError(f"intrinsics: expected shape (3, 3) or ({len(poses)}, 3, 3), received {intrinsics.shape}")
+            raise ValueError(f"intrinsics: expected shape (3, 3) or ({len(poses)}, 3, 3), got {intrinsics.shape}")
         intrinsics = np.array(np.broadcast_to(intrinsics, (len(poses), 3, 3)))
         if not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
-            raise ValueError("world_from_camera, intrinsics: expected finite numbers, received NaN or infinity")
+            raise ValueError("world_from_camera, intrinsics: expected finite numbers, got NaN or infinity")
         rotations = poses[:, :3, :3]
         error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
         if error > 1e-6 or np.linalg.det(rotations).min() < 0:
             raise ValueError(
-                "world_from_camera: expected rotations without scale or mirroring, received "
+                "world_from_camera: expected rotations without scale or mirroring, got "
                 f"|R R^T - 1| up to {error:.2g} and determinants from {np.linalg.det(rotations).min():.3g}"
             )
         if self.width < 1 or self.height < 1:
-            raise ValueError(f"width, height: expected at least 1 pixel, received {self.width} x {self.height}")
+            raise ValueError(f"width, height: expected at least 1 pixel, got {self.width} x {self.height}")
         if not 0 < self.near < self.far:
-            raise ValueError(f"near, far: expected 0 < near < far, received {self.near} and {self.far}")
+            raise ValueError(f"near, far: expected 0 < near < far, got {self.near} and {self.far}")
         poses.flags.writeable = False
         intrinsics.flags.writeable = False
         object.__setattr__(self, "world_from_camera", poses)
@@ -123,7 +123,7 @@ def fitting_field_of_view(distance: float) -> float:
     """
     if not _MARGIN * OBJECT_RADIUS < distance < math.inf:
         wanted = f"a finite number of more than {_MARGIN} (the object's radius is 1)"
-        raise ValueError(f"distance: expected {wanted}, received {distance}")
+        raise ValueError(f"distance: expected {wanted}, got {distance}")
     return math.degrees(2.0 * math.asin(_MARGIN * OBJECT_RADIUS / distance))
 
 
@@ -159,11 +159,11 @@ def look_at_origin(centres: npt.ArrayLike) -> Array:
 def aimed(directions: Array, resolution: int, distance: float, field_of_view: float | None) -> Rig:
     """Cameras that look at the origin from given directions (view, 3); other arguments as in `make_rig`."""
     if resolution < 1:
-        raise ValueError(f"resolution: expected at least 1 pixel, received {resolution}")
+        raise ValueError(f"resolution: expected at least 1 pixel, got {resolution}")
     fitting = fitting_field_of_view(distance)
     angle = fitting if field_of_view is None else field_of_view
     if not 0.0 < angle < 180.0:
-        raise ValueError(f"field_of_view: expected more than 0 and less than 180 degrees, received {field_of_view}")
+        raise ValueError(f"field_of_view: expected more than 0 and less than 180 degrees, got {field_of_view}")
     focal, middle = resolution / 2.0 / math.tan(math.radians(angle) / 2.0), (resolution - 1) / 2.0
     intrinsics = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
     near, far = distance - OBJECT_RADIUS, distance + OBJECT_RADIUS

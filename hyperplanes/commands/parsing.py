@@ -16,7 +16,7 @@ from hyperplanes.commands.options import Exists
 from hyperplanes.utilities.entry_points import find_entries
 from hyperplanes.utilities.messages.errors import did_you_mean
 
-__all__ = ["parse"]
+__all__ = ["as_option", "parse"]
 
 HELP = {"-h", "--help"}
 
@@ -53,6 +53,28 @@ def parse(verb: str, module: ModuleType, arguments: Sequence[str]) -> Any:
     )
     _check_values(parsed)
     return replace(parsed, settings=tuple(settings)) if settings else parsed
+
+
+def as_option(message: str, module: ModuleType, arguments: Sequence[str]) -> str:
+    """A message about arguments of a function, as one about the options that set them.
+
+    Args:
+        message: such as "field_of_view: expected ..."; any other is returned unchanged.
+        module: of the verb.
+        arguments: the command line after the verb. If two options may be meant, it is the one that was given.
+    """
+    fields_of = {each.name: each.field for each in _options_of(module.Arguments)}
+    given = {_name_of(argument) for argument in arguments}
+
+    def option(argument: str) -> str | None:
+        meant = [name for name, field in fields_of.items() if argument in (field, name[2:].replace("-", "_"))]
+        return min(meant, key=lambda name: name not in given, default=None)
+
+    about, colon, rest = message.partition(": ")
+    options = [option(each) for each in about.split(", ")]
+    if not colon or None in options:
+        return message
+    return f"{', '.join(filter(None, options))}: {rest}"
 
 
 def _refuse_repeated(arguments: Sequence[str]) -> None:
@@ -127,6 +149,7 @@ def _check_words(verb: str, declared: type, arguments: Sequence[str]) -> None:
 class _Option:
     """What an option takes, by the annotation of its field."""
 
+    field: str
     name: str
     hint: Any
     required: bool
@@ -164,7 +187,7 @@ def _options_of(declared: type) -> Iterator[_Option]:
         renamed = next((note.name for note in notes if getattr(note, "name", None)), None)
         name = renamed or each.name.replace("_", "-")
         positional = any(repr(note) == "Positional" for note in notes)
-        yield _Option(name.upper() if positional else f"--{name}", hint, _is_required(each))
+        yield _Option(each.name, name.upper() if positional else f"--{name}", hint, _is_required(each))
 
 
 def _is_required(each: Field[Any]) -> bool:

@@ -154,18 +154,18 @@ def test_one_intrinsic_matrix_serves_all_views():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: rigs.fixed(0, 16), r"received \(0, 4, 4\)"),
-        (lambda: rigs.fixed(4, 0), "at least 1 pixel, received 0"),
-        (lambda: rigs.fixed(4, 16, distance=1.0), "more than 1.04 .* received 1.0"),
-        (lambda: rigs.fixed(4, 16, distance=math.inf), "distance: expected a finite number .* received inf"),
-        (lambda: rigs.fixed(4, 16, field_of_view=180.0), "received 180.0"),
-        (lambda: Rig(np.eye(4), np.eye(3), 4, 4, 1, 2), r"received \(4, 4\)"),
-        (lambda: Rig(np.eye(4)[None], np.eye(4), 4, 4, 1, 2), r"received \(4, 4\)"),
+        (lambda: rigs.fixed(0, 16), r"got \(0, 4, 4\)"),
+        (lambda: rigs.fixed(4, 0), "at least 1 pixel, got 0"),
+        (lambda: rigs.fixed(4, 16, distance=1.0), "more than 1.04 .* got 1.0"),
+        (lambda: rigs.fixed(4, 16, distance=math.inf), "distance: expected a finite number .* got inf"),
+        (lambda: rigs.fixed(4, 16, field_of_view=180.0), "got 180.0"),
+        (lambda: Rig(np.eye(4), np.eye(3), 4, 4, 1, 2), r"got \(4, 4\)"),
+        (lambda: Rig(np.eye(4)[None], np.eye(4), 4, 4, 1, 2), r"got \(4, 4\)"),
         (lambda: Rig(2 * np.eye(4)[None], np.eye(3), 4, 4, 1, 2), "without scale or mirroring"),
         (lambda: Rig(np.diag([1.0, 1, -1, 1])[None], np.eye(3), 4, 4, 1, 2), "determinants from -1"),
         (lambda: Rig(np.eye(4)[None] * np.nan, np.eye(3), 4, 4, 1, 2), "NaN"),
-        (lambda: Rig(np.eye(4)[None], np.eye(3), 4, 0, 1, 2), "received 4 x 0"),
-        (lambda: Rig(np.eye(4)[None], np.eye(3), 4, 4, 2, 2), "received 2 and 2"),
+        (lambda: Rig(np.eye(4)[None], np.eye(3), 4, 0, 1, 2), "got 4 x 0"),
+        (lambda: Rig(np.eye(4)[None], np.eye(3), 4, 4, 2, 2), "got 2 and 2"),
     ],
 )
 def test_wrong_input_is_named_in_the_error(call, message):

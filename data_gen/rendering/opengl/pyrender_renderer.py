@@ -93,9 +93,7 @@ def _shared_renderer(platform: str) -> Any:
         _renderer, _made_in = context, (os.getpid(), threading.get_ident())
     elif os.environ.get("PYOPENGL_PLATFORM") != platform:
         loaded = os.environ.get("PYOPENGL_PLATFORM")
-        raise RendererError(
-            f"renderer: expected pyrender-{loaded}, which this process uses, received pyrender-{platform}"
-        )
+        raise RendererError(f"renderer: expected pyrender-{loaded}, which this process uses, got pyrender-{platform}")
     _check_owner()
     return _renderer._renderer
 
@@ -105,7 +103,7 @@ def _check_owner() -> None:
     if _made_in != here:
         raise RendererError(
             "renderer: expected the process and thread that made the OpenGL context "
-            f"{_made_in}, received {here}; start workers with the 'spawn' method and draw in one thread of each"
+            f"{_made_in}, got {here}; start workers with the 'spawn' method and draw in one thread of each"
         )
 
 

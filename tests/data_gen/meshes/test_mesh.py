@@ -101,7 +101,7 @@ def test_z_up_is_rotated_to_y_up(tmp_path):
     turned = upright.world_from_file[:3, :3] @ [0, 0, 1]
     assert turned[1] > 0
     assert np.allclose(turned[[0, 2]], 0)
-    with pytest.raises(ValueError, match="up: expected 'y' or 'z', received 'x'"):
+    with pytest.raises(ValueError, match="up: expected 'y' or 'z', got 'x'"):
         load_mesh(path, up="x")
 
 

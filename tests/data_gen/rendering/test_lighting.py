@@ -86,10 +86,10 @@ def test_sheets_are_lit_on_both_sides():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: resolve_lighting("disco"), "studio, headlight, random or a Lighting, received 'disco'"),
+        (lambda: resolve_lighting("disco"), "studio, headlight, random or a Lighting, got 'disco'"),
         (lambda: Lighting((Light((0, 0, 2.0), (1, 1, 1)),), (0, 0, 0), (0, 0, 0)), "of length 2"),
-        (lambda: Lighting((Light((0, 0, 1.0), (1, -1, 1)),), (0, 0, 0), (0, 0, 0)), r"received \(1, -1, 1\)"),
-        (lambda: Lighting((Light((0, 0, 1.0), (1, 1, 1)),) * 5, (0, 0, 0), (0, 0, 0)), "at most 4, received 5"),
+        (lambda: Lighting((Light((0, 0, 1.0), (1, -1, 1)),), (0, 0, 0), (0, 0, 0)), r"got \(1, -1, 1\)"),
+        (lambda: Lighting((Light((0, 0, 1.0), (1, 1, 1)),) * 5, (0, 0, 0), (0, 0, 0)), "at most 4, got 5"),
     ],
 )
 def test_wrong_input_is_named_in_the_error(call, message):

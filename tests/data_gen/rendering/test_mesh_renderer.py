@@ -351,11 +351,11 @@ def test_invisible_and_invalid_objects_are_named(backend):
     renderer = MeshRenderer(backend)
     for parts, message in (
         ([placed(sheet(), away)], "teapot: expected some of it to be visible in 1 views"),
-        ([], "teapot: expected at least one face, received 0 parts"),
-        ([empty], "teapot: expected at least one face, received 1 parts"),
-        ([broken], "teapot, part 0: expected finite vertices, received 1 faces"),
-        ([several], "part 0: expected a PBRMaterial or a SimpleMaterial, received MultiMaterial"),
-        ([untextured], "texture coordinates for its 4 textured vertices, received none"),
+        ([], "teapot: expected at least one face, got 0 parts"),
+        ([empty], "teapot: expected at least one face, got 1 parts"),
+        ([broken], "teapot, part 0: expected finite vertices, got 1 faces"),
+        ([several], "part 0: expected a PBRMaterial or a SimpleMaterial, got MultiMaterial"),
+        ([untextured], "texture coordinates for its 4 textured vertices, got none"),
     ):
         with pytest.raises(RenderError, match=message):
             renderer.render(parts, rig, name="teapot")
@@ -363,11 +363,11 @@ def test_invisible_and_invalid_objects_are_named(backend):
 
 
 def test_wrong_arguments_are_named():
-    with pytest.raises(ValueError, match="expected 1 to 8, received 9"):
+    with pytest.raises(ValueError, match="expected 1 to 8, got 9"):
         MeshRenderer("embree", supersample=9)
-    with pytest.raises(ValueError, match="received 'vulkan'"):
+    with pytest.raises(ValueError, match="got 'vulkan'"):
         MeshRenderer("vulkan")
-    with pytest.raises(ValueError, match="rgba, depth, normals, coordinates, received rgb"):
+    with pytest.raises(ValueError, match="rgba, depth, normals, coordinates, got rgb"):
         MeshRenderer("embree").render([sheet()], _front_rig(8), channels=("rgb",))
 
 
@@ -389,7 +389,7 @@ def test_rasterisers_share_the_context_and_other_threads_are_refused():
     thread.join()
     assert outer.render(parts, rig).rgba.any()
     assert "spawn" in caught[0]
-    with pytest.raises(RendererError, match="pyrender-egl, which this process uses, received pyrender-osmesa"):
+    with pytest.raises(RendererError, match="pyrender-egl, which this process uses, got pyrender-osmesa"):
         MeshRenderer("pyrender-osmesa")
 
 
