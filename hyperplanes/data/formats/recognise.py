@@ -118,7 +118,8 @@ def _find_catalogue(path: Path, legacy: bool) -> Catalogue:
         return _one_scene(path, legacy)
     if not path.is_dir():
         refuse_unposed(path)
-        raise DataError(path, "the folder of a data set", "nothing", "check the path, or run hyperplanes generate")
+        what = "a file" if path.exists() else "nothing"
+        raise DataError(path, "the folder of a data set", what, "check the path, or run hyperplanes generate")
     manifest = read_json(path / MANIFEST) if (path / MANIFEST).is_file() else {}
     if manifest.get("format") == DATA_SET and manifest.get("layout", "native") == "native":
         return native(path, manifest)
