@@ -60,8 +60,11 @@ class Trainings:
         if trained.packaged:
             return packaged_folder(trained.packaged)
         reference = trained.reference and self.folder(experiment, trained.reference, seed)
-        chosen = self.configuration(experiment, trained, seed)
-        work = partial(self.train, trained, chosen, self.arranged(trained, chosen), reference)
+
+        def work(folder: Path) -> None:
+            chosen = self.configuration(experiment, trained, seed)
+            self.train(trained, chosen, self.arranged(trained, chosen), reference, folder)
+
         return self.workspace.folder(*self._place(experiment, trained, seed), work)
 
     def is_made(self, experiment: Experiment, trained: Trained, seed: int) -> bool:
