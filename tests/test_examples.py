@@ -19,11 +19,11 @@ def blocks(page):
 def test_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     here, first = {}, blocks(README)[0].replace("frames=48", "frames=2, size=24")
-    assert first.count("  # 25 support views, 25 query views\n") == 1
+    assert first.count("  # 25 images for the model, 25 others to compare with\n") == 1
     few = "\nassert (len(task.support), len(task.query)) == (25, 25)"
     few += "\nimport dataclasses; task = dataclasses.replace(task, query=task.query[:2])\n"
     with small_packaged(residuals=False):
-        exec(first.replace("  # 25 support views, 25 query views\n", few), here)
+        exec(first.replace("  # 25 images for the model, 25 others to compare with\n", few), here)
     assert len(list((tmp_path / "new-views").glob("*.png"))) == len(here["task"].query)
     assert (tmp_path / "turntable.webp").exists()
 
