@@ -250,8 +250,8 @@ class HyperPlanesNetwork(nn.Module):
         return pixels[views.masks.flatten()[pixels] != views.masks.new_tensor(UNKNOWN)]
 
 
-_in_use: dict[nn.Module, tuple[int, dict[nn.Module, bool]]] = {}
-"""How many threads use each module, and the training modes of its parts before."""
+_in_use: dict[nn.Module, tuple[int, bool]] = {}
+"""How many users each module has, and whether it was in training mode before."""
 
 _counting = Lock()
 
@@ -260,20 +260,22 @@ _counting = Lock()
 def in_use(module: nn.Module) -> Generator[None]:
     """Evaluation mode for the module while the context lasts.
 
-    Several threads may use it at once: the earlier mode is restored when the last of them has ended.
+    Several threads may use it, or models that share parts of it, at once: the earlier mode of each part is restored
+    when its last user has ended.
     """
+    parts = list(module.modules())
     with _counting:
-        users, before = _in_use.get(module, (0, {part: part.training for part in module.modules()}))
-        _in_use[module] = users + 1, before
-        if not users:
-            module.eval()
+        for part in parts:
+            users, before = _in_use.get(part, (0, part.training))
+            _in_use[part] = users + 1, before
+            part.training = False
     try:
         yield
     finally:
         with _counting:
-            users, before = _in_use.pop(module)
-            if users > 1:
-                _in_use[module] = users - 1, before
-            else:
-                for part, training in before.items():
-                    part.training = training
+            for part in parts:
+                users, before = _in_use.pop(part)
+                if users > 1:
+                    _in_use[part] = users - 1, before
+                else:
+                    part.training = before

@@ -422,6 +422,18 @@ def test_a_new_model_leaves_the_generators_of_all_devices_alone(monkeypatch):
     assert all(torch.equal(value, other.state_dict()[name]) for name, value in one.state_dict().items())
 
 
+def test_shared_parts_are_in_evaluation_mode_until_the_last_model_ends():
+    model = small_model().train()
+    other = model.without_residuals()
+    first, second = in_use(model), in_use(other)
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert not any(part.training for part in other.modules())
+    second.__exit__(None, None, None)
+    assert all(part.training for part in [*model.modules(), *other.modules()])
+
+
 def test_a_module_is_in_evaluation_mode_until_its_last_user_ends():
     model = small_model().train()
     model.networks.eval()

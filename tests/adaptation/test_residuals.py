@@ -271,6 +271,8 @@ def test_a_model_corrects_the_pictures_of_its_fields(many, query, azimuth):
     assert (found - plain.render(query.cameras).images).abs().max() > 0.02
     for options in ({"sampling": RayMarching(12)}, {"antialias": False}):
         assert torch.equal(field.render(query.cameras, **options).images, plain.render(query.cameras, **options).images)
+    assert torch.equal(field.render(query.cameras, antialias=True).images, found)
+    assert torch.equal(field.with_sampling(field.sampling).render(query.cameras).images, found)
     rays, _, _ = query.rays_at(torch.arange(40))
     assert torch.equal(field.trace(rays).colour, plain.trace(rays).colour)
     assert not isinstance(field.with_sampling(RayMarching(12)), CorrectedField)
@@ -282,6 +284,8 @@ def test_a_model_without_residuals_is_another_one_with_the_same_weights(many):
     assert not isinstance(plain.adapt(many), CorrectedField)
     assert isinstance(corrected.adapt(many), CorrectedField)
     assert all(own is other for own, other in zip(plain.parameters(), corrected.parameters(), strict=True))
+    plain.hypernetwork = None
+    assert corrected.hypernetwork is not None
 
 
 def test_pictures_of_few_or_large_views_or_without_masks_are_not_corrected(many, monkeypatch):

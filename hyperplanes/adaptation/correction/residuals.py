@@ -166,8 +166,8 @@ class ResidualField:
 class CorrectedField(AdaptedField):
     """A field whose pictures are corrected by residuals of its support views.
 
-    Densities, colours, rays and meshes are those of the field, and so are pictures with a given sampler or `antialias`:
-    residuals are computed for pictures with the defaults.
+    Densities, colours, rays and meshes are those of the field, and so are pictures with a given sampler, or without
+    the default of `antialias`: residuals are computed for pictures with the defaults.
 
     Attributes:
         uncorrected: the field.
@@ -185,8 +185,8 @@ class CorrectedField(AdaptedField):
         return self.uncorrected
 
     def with_sampling(self, sampling: Sampler) -> AdaptedField:
-        """As `AdaptedField.with_sampling`, without correction."""
-        return self.uncorrected.with_sampling(sampling)
+        """As `AdaptedField.with_sampling`; without correction if the sampler is another one."""
+        return self if sampling == self.sampling else self.uncorrected.with_sampling(sampling)
 
     @property
     def refined_occupancy(self) -> RefinedOccupancy:
@@ -205,7 +205,7 @@ class CorrectedField(AdaptedField):
         self, cameras: PinholeCamera, sampling: Sampler | None, antialias: bool | None, mixed_precision: bool
     ) -> Pictures:
         pictures = self.uncorrected.render(cameras, sampling, antialias, mixed_precision=mixed_precision)
-        if sampling is not None or antialias is not None:
+        if sampling is not None or antialias not in (None, self.sampling.needs_occupancy):
             return pictures
         return self.residuals.correct(pictures, cameras)
 
