@@ -52,7 +52,7 @@ def _checked(original, *, typechecker):
 
 def checked_once(function, wrap):
     """A function that calls `wrap(function)` for the first call of each kind, and `function` afterwards."""
-    seen, made, held, this_thread = set(), {}, {}, threading.get_ident  # made when needed, in a millisecond each
+    seen, made, held, this_thread = {}, {}, {}, threading.get_ident  # made when needed, in a millisecond each
 
     def checked():
         if "function" not in made:
@@ -81,40 +81,57 @@ def checked_once(function, wrap):
         __tracebackhide__ = True
         if jaxtyping.config.jaxtyping_disable:
             return function(*given, **named)
-        sizes = {}
-        arguments = kind(given, sizes), kind(named, sizes)
-        known = arguments in seen
-        result = (function if known else checked())(*given, **named)
-        both = arguments, kind(result, sizes)
-        if both not in seen:
-            if known:
+        found, sizes = [], {}
+        for each in given:
+            describe(each, found, sizes)
+        for name, each in named.items():
+            found.append(name)
+            describe(each, found, sizes)
+        arguments, found = tuple(found), []
+        results = seen.get(arguments)
+        result = (checked() if results is None else function)(*given, **named)
+        describe(result, found, sizes)
+        kind = tuple(found)
+        if results is None or kind not in results:
+            if results is not None:
                 check_result(result, given, named)
-            seen.update((arguments, both))
+            seen.setdefault(arguments, set()).add(kind)
         return result
 
     return call
 
 
-@functools.cache
-def form(cls):
-    """How `kind` describes values of a class; cached, because a training step has a thousand arguments."""
-    forms = {"array": (torch.Tensor, np.ndarray), "sequence": (tuple, list), "mapping": dict, "text": str}
-    return next((name for name, classes in forms.items() if issubclass(cls, classes)), "other")
+class _Forms(dict):
+    """How `describe` treats the values of a class; cached, because a training step has a thousand arguments."""
+
+    def __missing__(self, cls):
+        forms = {"array": (torch.Tensor, np.ndarray), "sequence": (tuple, list), "mapping": dict, "text": str}
+        self[cls] = next((name for name, classes in forms.items() if issubclass(cls, classes)), "other")
+        return self[cls]
 
 
-def kind(value, sizes):
-    """The properties of a value that its check depends on; `sizes` numbers large sizes in order of appearance."""
+FORMS = _Forms()
+
+
+def describe(value, found, sizes):
+    """Append the properties of a value that its check depends on; `sizes` numbers large sizes in order of appearance."""
     cls = type(value)
-    shaped = form(cls)
-    if shaped == "other":
-        return cls
-    if shaped == "array":
-        found = [cls, value.dtype]
+    found.append(cls)
+    form = FORMS[cls]
+    if form == "other":
+        return
+    if form == "array":
+        found.append(value.dtype)
         for size in value.shape:
             found.append(size if size < NAMED else sizes.setdefault(size, -1 - len(sizes)))
-        return tuple(found)
-    if shaped == "sequence":
-        return cls, *[kind(each, sizes) for each in value]
-    if shaped == "mapping":
-        return dict, *[(key, kind(each, sizes)) for key, each in value.items()]
-    return value
+    elif form == "sequence":
+        found.append(len(value))
+        for each in value:
+            describe(each, found, sizes)
+    elif form == "mapping":
+        found.append(len(value))
+        for key, each in value.items():
+            found.append(key)
+            describe(each, found, sizes)
+    else:
+        found.append(value)
