@@ -114,7 +114,7 @@ FORMS = _Forms()
 
 
 def describe(value, found, sizes):
-    """Append the properties of a value that its check depends on; `sizes` numbers large sizes in order of appearance."""
+    """Append what the check of a value depends on to a list; `sizes` numbers large sizes in order of appearance."""
     cls = type(value)
     found.append(cls)
     form = FORMS[cls]
