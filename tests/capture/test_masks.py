@@ -177,6 +177,24 @@ def test_given_masks_are_not_changed_and_others_are_corrected(ball_seen, tmp_pat
     assert [note for note in captured.notes if "contradict" in note] == said
 
 
+@pytest.mark.parametrize("count", [6, 16])
+@pytest.mark.usefixtures("coarse")
+def test_an_empty_mask_that_was_given_is_noted(count, ball_seen, tmp_path, monkeypatch):
+    """Also with fewer than eight photographs, whose masks are not compared with each other."""
+    model, _, masks = ball_seen
+    model = replace(
+        model,
+        **{name: getattr(model, name)[:count] for name in ("pictures", "camera_from_world", "calibrations", "lenses")},
+    )
+    (tmp_path / "photos/masks").mkdir(parents=True)
+    for row, mask in enumerate(masks[:count]):
+        Image.fromarray(np.full((96, 96, 3), row, np.uint8)).save(tmp_path / f"photos/{row}.png")
+        Image.fromarray((255 * mask * (row != 3)).astype(np.uint8)).save(tmp_path / f"photos/masks/{row}.png")
+    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: model)
+    captured = pipeline.capture(tmp_path / "photos", tmp_path / "scene", Settings(mask="given"))
+    assert "1 empty mask, to be corrected or left out: 3" in captured.notes
+
+
 def test_points_label_the_pixels_in_which_they_are_observed(ball_seen):
     """In an image scaled down by four, pixel (43, 23) is in pixel (10, 5)."""
     cv2 = pytest.importorskip("cv2")
