@@ -121,6 +121,11 @@ class Views:
         if scale >= 1:
             return self
         size = max(1, round(self.size[0] * scale)), max(1, round(self.size[1] * scale))
+        if not len(self):  # no cameras have no size, and `interpolate` refuses no images
+            empty = (
+                None if each is None else each.new_zeros(0, each.shape[1], *size) for each in (self.images, self.masks)
+            )
+            return self._derived(**dict(zip(("images", "masks"), empty, strict=True)))
         images, masks = (
             None if each is None else interpolate(each, size, mode="area") for each in (self.images, self.masks)
         )

@@ -168,6 +168,13 @@ def test_sizes_below_one_pixel_are_refused():
                 change(views().cameras, no_size, 4)
 
 
+def test_no_views_can_be_resized():
+    none = views()[:0].resized(2)
+    assert len(none) == 0
+    assert max(none.size) == 2
+    assert none.cameras.batch_size == 0
+
+
 def test_drawing_rays_from_no_pixels_is_refused():
     with pytest.raises(ValueError, match="among: expected at least one pixel of 4 views to draw rays from, got none"):
         views().sample_rays(3, among=torch.zeros(0, dtype=torch.long))

@@ -141,7 +141,13 @@ def _run_probe(name: str) -> ProbeResult:
         # The package may be imported from a folder that a fresh interpreter does not look in.
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
         done = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=_PROBE_SECONDS, check=False
+            command,
+            env=environment,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_PROBE_SECONDS,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         message = f"no picture within {_PROBE_SECONDS:g} s"

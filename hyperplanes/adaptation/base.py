@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
@@ -17,7 +17,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.inputs import as_points
 from hyperplanes.geometry.kernels.threads import parallel_map
 from hyperplanes.geometry.notebooks import show_views
-from hyperplanes.geometry.occupancy import Occupancy, carve, full
+from hyperplanes.geometry.occupancy import MIN_MASK_OPACITY, Occupancy, carve, full
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.geometry.symmetry.reflections import Symmetry
 from hyperplanes.rendering.compositing import Rendered
@@ -27,13 +27,15 @@ from hyperplanes.rendering.refinement import RefinedOccupancy, refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
 from hyperplanes.rendering.scene import dtype_of, is_thread_safe, mapped
 from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.messages.errors import listed
 from hyperplanes.utilities.tensors.kept import kept
 from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.views import Views
 
-__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "attributes_of", "hull"]
+__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "attributes_of", "check_masks", "hull"]
 
 MARGIN_LOSS = 0.9  # `margin_loss` of `refine`: 2.4 % in one voxel
+HAZY = 0.5  # of the pixels of a mask: a larger share with an opacity of less than MIN_MASK_OPACITY is refused
 POINTS = 1 << 12  # per thread, for densities
 
 
@@ -222,17 +224,54 @@ def hull(support: Views, side: int, within: Occupancy | None = None) -> Occupanc
         within: voxels that the hull is known to lie in.
 
     Raises:
-        ValueError: masks whose hull is empty.
+        ValueError: an empty mask, masks whose background has some opacity, or masks whose hull is empty.
     """
     if support.masks is None:
         return full(support.bounds, side, support.images.device)
+    check_masks(support)
     carved = carve(support.masks, support.cameras, support.bounds, side, within=within)
-    seen = int((support.masks > 0).flatten(1).any(1).sum())
-    if not (seen and carved.occupied.any()):
-        found = f"{seen} of {len(support)} with a pixel set, and no point that all of them may show"
-        views = f" ({support.names[0]} to {support.names[-1]})" if support.names else ""
+    if not carved.occupied.any():
+        found = f"{len(support)} of {len(support)} with a pixel set, and no point that all of them may show"
         raise ValueError(
-            f"masks of the support views{views}: expected an object, got {found if seen else 'none with a pixel set'}; "
+            f"masks of the support views{_from_to(support.names)}: expected an object, got {found}; "
             "check alpha and poses, or leave the masks out"
         )
     return carved
+
+
+def check_masks(support: Views) -> None:
+    """Refuse masks that would silently make the hull far too small or too large.
+
+    An empty mask says that nothing of the object is in its picture: carving removes what all others show there. Methods
+    that begin with some of the views check all of them first, so that the message counts all.
+
+    Raises:
+        ValueError: some masks are empty, or have some opacity nearly everywhere.
+    """
+    if support.masks is None:
+        return
+    masks, names, flat = support.masks, support.names, support.masks.flatten(1)
+    empty: list[int] = (flat.amax(1) == 0).nonzero()[:, 0].tolist()
+    if empty and len(empty) == len(masks):
+        raise ValueError(
+            f"masks of the support views{_from_to(names)}: expected an object, got none with a pixel set; "
+            "check alpha and poses, or leave the masks out"
+        )
+    if empty:
+        found = f"{len(empty)} of {len(masks)} empty: {listed([names[view] if names else str(view) for view in empty])}"
+        raise ValueError(
+            f"masks of the support views: expected a part of the object in each, found {found}; "
+            "leave these views out or correct their masks"
+        )
+    # as much of faint opacity is no edge
+    hazy = ((flat > 0) & (flat < MIN_MASK_OPACITY)).float().mean(1) > HAZY
+    if hazy.any():
+        least = float(flat[hazy].median())
+        raise ValueError(
+            f"masks of the support views: expected opacity 0 in the background, found {least:.2g} in most pixels of "
+            f"{int(hazy.sum())} of {len(masks)}; set opacity below {MIN_MASK_OPACITY} to 0"
+        )
+
+
+def _from_to(names: Sequence[str]) -> str:
+    return f" ({names[0]} to {names[-1]})" if names else ""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
-from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.base import AdaptedField, check_masks
 from hyperplanes.adaptation.context import SupportContext, observe, trained_on
 from hyperplanes.adaptation.correction.stacking import stacked_field, tuned_field
 from hyperplanes.adaptation.network import HyperPlanesNetwork
@@ -91,6 +91,7 @@ def fine_tune(
         return _fine_tune_in_frame(network, support, steps, settings, None, on_step)
 
     # the number of steps that is best for held-out views, with the share of random weights for all views
+    check_masks(support)
     settings = settings.for_views(len(support), network.target.permutation_invariant)
     shown, holdout = split_holdout(support, settings)
     placed = to_canonical_frame(network, shown)

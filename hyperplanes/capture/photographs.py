@@ -22,11 +22,13 @@ from hyperplanes.data.pictures.images import (
     HEIF_SUFFIXES,
     PICTURE_SUFFIXES,
     image_header,
-    opacity_of,
     read_image,
+    read_mask,
     turned,
+    without_haze,
 )
 from hyperplanes.data.pictures.masks import match_masks
+from hyperplanes.utilities.files.order import natural_order
 from hyperplanes.utilities.files.reading import DataError
 from hyperplanes.utilities.messages.errors import listed
 from hyperplanes.utilities.messages.formatting import counted
@@ -91,7 +93,8 @@ def find_photographs(folder: Path) -> list[Path]:
         raise DataError(
             heif[0], "JPEG, PNG, WebP or TIFF", "HEIC", "pip install pillow-heif, or have the phone save JPEG"
         )
-    found = sorted(heif + [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES], key=_natural)
+    pictures = heif + [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
+    found = sorted(pictures, key=lambda path: natural_order(path.name))
     if len(found) < FEWEST:
         wanted = f"at least {FEWEST} photographs of one object"
         raise DataError(folder, wanted, counted(len(found), "photograph"), _elsewhere(folder))
@@ -177,10 +180,10 @@ def read_upright(
     stored = rgba.shape[:2]
     rgba = turned(rgba, photograph.orientation)
     upright = rgba.shape[:2]
-    opacity = rgba[..., 3] if alpha else None
+    opacity = without_haze(rgba[..., 3]) if alpha else None
     if photograph.mask is not None:
-        values, has_alpha = read_image(photograph.mask)
-        opacity = opacity_of(values, has_alpha)
+        opacity = read_mask(photograph.mask)
+        given = opacity.shape
         if _same_shape(opacity.shape, stored) and not _same_shape(opacity.shape, upright):
             opacity = turned(opacity, photograph.orientation)  # the mask belongs to the pixels as they are stored
         elif stored == upright and photograph.orientation != 1:
@@ -189,7 +192,7 @@ def read_upright(
             raise DataError(
                 photograph.mask,
                 f"the shape of {photograph.path.name}, {stored[1]} x {stored[0]} pixels",
-                f"{values.shape[1]} x {values.shape[0]}",
+                f"{given[1]} x {given[0]}",
                 "give each photograph a mask of its own shape",
             )
     height, width = scaled_size(upright, max_size)
@@ -229,11 +232,6 @@ def _with_one_shape(photographs: list[Photograph]) -> list[Photograph]:
         replace(one, turned=one.size[0] != one.size[1] and (one.size[1] > one.size[0]) != usual[one.camera])
         for one in photographs
     ]
-
-
-def _natural(path: Path) -> list[Any]:
-    """A key that sorts numbers in names as numbers."""
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", path.name.lower()) if part]
 
 
 def _reads_heif() -> bool:

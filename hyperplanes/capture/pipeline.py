@@ -357,6 +357,9 @@ def _placed(
                 )
         work.progress("agreement", 1, 1, f"{1 - float(found.disagreement.mean()):.1%} of their area")
         masks = [mask if kept else other for mask, other, kept in zip(masks, found.masks, own, strict=True)]
+        if names := [one.name for one, mask in zip(photographs, masks, strict=True) if not mask.any()]:
+            # models refuse such views
+            work.notes.append(f"{counted(len(names), 'empty mask')}, to be corrected or left out: {listed(names)}")
         sphere = found.sphere or sphere
     up, source = find_up(model, np.array([one.up_in_camera for one in photographs]), sphere, chosen)
     return Placement(sphere, up, source), masks

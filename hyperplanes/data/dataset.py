@@ -183,22 +183,37 @@ class Datasets:
         return [f"{part}/{name}" for part, data in self.parts.items() for name in data.names(split)]
 
     def class_of(self, name: str) -> str:
-        """The class of one object; the name of its data set if that does not state the class."""
-        part, _, own = name.partition("/")
-        return self.parts[part].class_of(own) or part
+        """The class of one object; the name of its data set if that does not state the class.
+
+        Args:
+            name: one of `names()`.
+
+        Returns:
+            The class. Raises DataError if there is no such data set.
+        """
+        data, own = self._find(name)
+        return data.class_of(own) or name.partition("/")[0]
 
     @checked
     def task(self, name: str) -> Task:
         """One object; as `Dataset.task`.
 
-        Raises:
-            DataError: no such data set or object, or a file of it is missing or invalid.
+        Args:
+            name: one of `names()`.
+
+        Returns:
+            As `Dataset.task`. Raises DataError if there is no such data set.
         """
+        data, own = self._find(name)
+        return replace(data.task(own), name=name)
+
+    def _find(self, name: str) -> tuple[Dataset, str]:
+        """The data set of an object, and the name of the object in it; DataError if there is no such data set."""
         part, _, own = name.partition("/")
         if part not in self.parts:
             known = ", ".join(self.parts)
             raise DataError(Path(part), f"one of the data sets {known}", repr(name), "check the name")
-        return replace(self.parts[part].task(own), name=name)
+        return self.parts[part], own
 
 
 def open_datasets(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.files.order import natural_order
 from hyperplanes.views import Task, join_views
 
 __all__ = ["Choice", "FewerQueries", "Inputs", "Shown", "SingleView", "WithBounds", "WithSupport"]
@@ -146,6 +148,8 @@ class Shown(TaskWrapper):
 class Inputs(TaskWrapper):
     """Tasks whose support views have given positions in the order of view names; all other views are query views.
 
+    Numbers in names are sorted as numbers, so that r_2 comes before r_10.
+
     It serves protocols that prescribe their input views, such as view 64, or 64 and 128, of SRN's 251.
 
     Attributes:
@@ -162,7 +166,9 @@ class Inputs(TaskWrapper):
     def change(self, task: Task) -> Task:
         """The task with these support views; raises ValueError if the object has no such view."""
         views = join_views(task.support, task.query)
-        order = sorted(range(len(views)), key=lambda index: views.names[index]) if views.names else range(len(views))
+        order: Sequence[int] = range(len(views))
+        if views.names:
+            order = sorted(order, key=lambda index: natural_order(views.names[index]))
         if max(self.places) >= len(views):
             found = " ".join(map(str, self.places))
             raise ValueError(f"{task.name}: expected inputs from 0 to {len(views) - 1}, got {found}; name other views")

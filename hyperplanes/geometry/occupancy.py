@@ -24,9 +24,12 @@ from hyperplanes.utilities.tensors.kept import kept
 from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.utilities.tensors.transforms import are_plain
 
-__all__ = ["Occupancy", "ball_extent", "carve", "dilate", "full", "ranges"]
+__all__ = ["MIN_MASK_OPACITY", "Occupancy", "ball_extent", "carve", "dilate", "full", "ranges"]
 
 LARGEST_SIDE = 1024  # voxels an axis: 1 GiB
+MIN_MASK_OPACITY = 0.03
+"""Opacity below which a pixel of a mask counts as background when files are read. Edges of supersampled pictures have
+at least 1/16. Masks that were scaled down may have less, so `carve` takes any value above 0 for the object."""
 
 
 @dataclass(frozen=True)

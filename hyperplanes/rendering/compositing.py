@@ -72,7 +72,8 @@ def composite(
         The pixels, and the weights for importance sampling.
     """
     # optical depth of each interval, and of all before it
-    optical_depth = density * edges.diff(dim=1)
+    lengths = edges.diff(dim=1)
+    optical_depth = torch.where(lengths != 0, density, 0.0) * lengths  # infinity times 0 is not a number
     before = torch.cat([torch.zeros_like(optical_depth[:, :1]), optical_depth.cumsum(1)], 1)
     transmittance = torch.exp(-before)
     # weights T_i (1 - exp(-sigma_i delta_i)) = T_i - T_{i+1}

@@ -10,7 +10,7 @@ import torch
 from hyperplanes.adaptation import AdaptedField
 from hyperplanes.adaptation.base import hull
 from hyperplanes.geometry.cameras import concatenate, look_at, pinhole, to
-from hyperplanes.geometry.occupancy import Occupancy, full
+from hyperplanes.geometry.occupancy import MIN_MASK_OPACITY, Occupancy, full
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering import Hierarchical, RayMarching, composite
 from hyperplanes.views import Views
@@ -214,6 +214,35 @@ def test_masks_with_an_empty_hull_are_refused():
     apart[0, 0, 0, 0] = apart[1, 0, -1, -1] = apart[2, 0, 0, -1] = 1.0
     with pytest.raises(ValueError, match="got 3 of 3 with a pixel set, and no point that all of them may show; check"):
         hull(replace(views, masks=apart, bounds=Sphere(radius=0.3)), 32)
+
+
+def test_an_empty_mask_is_refused_by_name_or_number():
+    """It says that nothing of the object is in its picture, and would remove what all other masks show."""
+    views = ball_views(ring(5))
+    views.masks[3] = 0.0
+    message = (
+        "masks of the support views: expected a part of the object in each, found 1 of 5 empty: 3; "
+        "leave these views out or correct their masks"
+    )
+    for refused in (lambda given: hull(given, 16), small_model().find_symmetry, small_model().adapt):
+        with pytest.raises(ValueError, match=f"^{message}$"):
+            refused(views)
+    views.masks[1] = 0.0
+    with pytest.raises(ValueError, match="found 2 of 5 empty: r_1, r_3; leave"):
+        hull(replace(views, names=tuple(f"r_{index}" for index in range(5))), 16)
+    assert hull(views[[0, 2, 4]], 16).occupied.any()
+
+
+def test_masks_whose_background_is_hardly_opaque_are_refused():
+    """An opacity of 1 / 255 in the whole background would make the hull all that the cameras see."""
+    views = ball_views(ring(5))
+    hazy = replace(views, masks=views.masks.clamp_min(1 / 255))
+    with pytest.raises(
+        ValueError, match=r"expected opacity 0 in the background, found 0.0039 in most pixels of 5 of 5"
+    ):
+        hull(hazy, 16)
+    cleared = replace(hazy, masks=torch.where(hazy.masks < MIN_MASK_OPACITY, 0.0, hazy.masks))
+    assert torch.equal(hull(cleared, 16).occupied, hull(views, 16).occupied)
 
 
 @pytest.mark.parametrize("sampling", [RayMarching(60), Hierarchical(24, 24)])

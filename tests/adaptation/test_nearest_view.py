@@ -116,3 +116,10 @@ def test_the_opacity_is_the_mask_of_the_copied_view_or_1_without_masks():
 def test_no_views_are_refused():
     with pytest.raises(ValueError, match="support: expected at least one view, got none"):
         NearestView().adapt(ball_views(ring(2))[:0])
+
+
+def test_no_cameras_have_no_pictures():
+    views = support()
+    pictures = NearestView().adapt(views).render(select(views.cameras, slice(0, 0)))
+    assert len(pictures.images) == len(pictures.opacity) == len(pictures.depth) == 0
+    assert pictures.images.shape[1:] == (3, *views.size)

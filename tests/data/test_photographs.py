@@ -12,7 +12,7 @@ from PIL.PngImagePlugin import PngImageFile
 
 from hyperplanes.adaptation.base import hull
 from hyperplanes.data import DataError, read_task, read_views
-from hyperplanes.data.pictures.images import image_header, opacity_of, read_image
+from hyperplanes.data.pictures.images import image_header, opacity_of, read_image, read_mask
 from hyperplanes.data.pictures.masks import match_masks
 from hyperplanes.data.pictures.posed import Posed
 from hyperplanes.export.images import orbit_cameras
@@ -328,6 +328,40 @@ def test_masks_of_zeros_and_ones_are_black_and_white():
     pixels[0, :, :3], pixels[..., 3] = 1, 255
     assert opacity_of(pixels, False).tolist() == [[255, 255], [0, 0]]
     assert not opacity_of(np.zeros((2, 2, 4), np.uint8), False).any()
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int32, bool])
+def test_masks_of_zeros_and_ones_are_black_and_white_at_any_depth(kind, tmp_path):
+    values = np.array([[0, 1, 1], [1, 0, 0]])
+    path = tmp_path / ("mask.tiff" if kind is np.int32 else "mask.png")
+    Image.fromarray(values.astype(kind)).save(path)
+    np.testing.assert_array_equal(read_mask(path), 255 * values)
+
+
+def test_every_label_of_a_coloured_palette_is_opaque_but_the_first(tmp_path):
+    """PASCAL VOC's masks: the palette gives 0 black, 1 (128, 0, 0) and the border 255 (224, 224, 192)."""
+    labels = np.array([[0, 1, 1], [2, 0, 255]], np.uint8)
+    image = Image.fromarray(labels)
+    colours = np.zeros((256, 3), np.uint8)
+    colours[1], colours[2], colours[255] = (128, 0, 0), (0, 128, 0), (224, 224, 192)
+    image.putpalette(colours.tobytes())
+    assert image.mode == "P"
+    image.save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), [[0, 255, 255], [255, 0, 255]])
+
+
+def test_a_palette_of_greys_gives_the_opacity_whatever_the_order_of_its_colours(tmp_path):
+    """As programs that compress PNG write a mask: here white is the first colour."""
+    image = Image.fromarray(np.array([[0, 1, 2]], np.uint8))
+    image.putpalette([255, 255, 255, 0, 0, 0, 90, 90, 90])
+    image.save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), [[255, 0, 90]])
+
+
+def test_hardly_opaque_pixels_of_masks_are_transparent(tmp_path):
+    """Programs that cut objects out leave 1 or 2 of 255 in the background; 16 is the edge of a supersampled picture."""
+    Image.fromarray(np.array([[0, 1, 7, 16, 255]], np.uint8)).save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), [[0, 0, 0, 16, 255]])
 
 
 @pytest.mark.parametrize("orientation", [1, 6])

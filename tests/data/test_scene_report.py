@@ -67,6 +67,18 @@ def test_masks_of_the_background_are_reported_as_inverted():
     assert [view.name for view in report.views if view.faults] == [report.views[3].name]
 
 
+def test_an_empty_mask_is_named():
+    views = ball()
+    views.masks[3] = 0
+    report = describe_scene(views)
+    assert {view.name: view.faults for view in report.views if view.faults} == {"3.png": ("the mask is empty",)}
+    assert report.worst[0].name == "3.png"
+    assert (
+        report.expectation()
+        == "poor pictures: 1 of 12 masks show nothing; leave these views out or correct their masks"
+    )
+
+
 def test_the_widest_gap_lies_between_views_that_are_named():
     """A view that looks steeply down does not divide a gap."""
     report = describe_scene(standing(*((20 * index, 10) for index in range(11)), (280, 85)))

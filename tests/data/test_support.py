@@ -102,6 +102,22 @@ def test_inputs_are_numbered_in_the_order_of_their_names(named):
             Inputs(Alternating(), wrong)
 
 
+def test_inputs_are_numbered_by_the_numbers_in_their_names():
+    """As Blender writes them: r_0 to r_11 without zeros in front, where r_10 comes after r_9."""
+
+    class Counted(Balls):
+        def task(self, name):
+            task = super().task(name)
+            halves = [tuple(f"test/r_{3 * index + 7 * half}.png" for index in range(4)) for half in (0, 1)]
+            return replace(
+                task, support=replace(task.support, names=halves[0]), query=replace(task.query, names=halves[1])
+            )
+
+    task = Inputs(Counted(), (0, 1, 2)).task("test0")
+    assert task.support.names == ("test/r_0.png", "test/r_3.png", "test/r_6.png")
+    assert task.query.names == tuple(f"test/r_{number}.png" for number in (7, 9, 10, 13, 16))
+
+
 def test_the_support_can_be_the_views_that_are_farthest_apart():
     data = Balls(views=12)
     directions = data.task("test0").support.camera_directions

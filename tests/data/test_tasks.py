@@ -62,8 +62,9 @@ def test_several_data_sets_are_one_with_prefixed_names(tmp_path, folder):
     task = both.task(f"b/{name}")
     assert task.name == f"b/{name}"
     assert torch.equal(task.support.images, one.task(name).support.images)
-    with pytest.raises(DataError, match="one of the data sets a, b"):
-        both.task(f"c/{name}")
+    for call in (both.task, both.class_of):
+        with pytest.raises(DataError, match="one of the data sets a, b"):
+            call(f"c/{name}")
     with pytest.raises(ValueError, match="data: expected folders of different names, got a, a"):
         open_datasets([copies[0], tmp_path / "a"])
 

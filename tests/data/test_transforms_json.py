@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from hyperplanes.commands.inputs.scene import read_path, read_scene
 from hyperplanes.commands.output.console import Console
@@ -283,3 +284,22 @@ def test_any_error_of_a_reader_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("hyperplanes.data.formats.recognise.read_posed_task", stumble)
     with pytest.raises(DataError, match="expected posed images of one scene, found"):
         read_scene(tmp_path, Console(silent=True))
+
+
+@pytest.mark.parametrize("separate", [False, True])
+def test_a_background_that_is_hardly_opaque_is_transparent(scene, tmp_path, separate):
+    """Images, masks and bounds are those of the same scene with a background of opacity 0 instead of 1 / 255."""
+    clear = read_views(scene.write(tmp_path / "clear"))
+    hazy = type(scene)()
+    for picture in hazy.pictures:
+        picture[picture[..., 3] == 0] = 0, 0, 0, 1
+    home = hazy.write(tmp_path / "hazy")
+    if separate:
+        (home / "masks").mkdir()
+        for name, picture in zip(hazy.names, hazy.pictures, strict=True):
+            Image.fromarray(picture[..., 3]).save(home / "masks" / Path(name).name)
+            Image.fromarray(picture[..., :3]).save(home / name)
+    found = read_views(home)
+    assert torch.equal(found.masks, clear.masks)
+    assert torch.equal(found.images, clear.images)
+    assert found.bounds == clear.bounds

@@ -209,6 +209,16 @@ def test_an_invalid_density_affects_only_its_own_ray(poison):
         assert found[3].item() == pytest.approx(math.exp(-0.5))  # all remaining transmittance
 
 
+def test_an_infinite_density_on_a_ray_that_misses_is_not_seen():
+    """All edges of such a ray are at one distance; packed, it has no samples. In the other ray it is opaque."""
+    edges = torch.tensor([[2.0, 2.0, 2.0], [2.0, 3.0, 4.0]])
+    density = torch.full((2, 2), math.inf, requires_grad=True)
+    seen, weights = composite(torch.full((2, 2, 3), 0.25), density, edges)
+    assert seen.colour.tolist() == [[1.0] * 3, [0.25] * 3]
+    assert weights.tolist() == [[0.0, 0.0], [1.0, 0.0]]
+    assert seen.opacity.tolist() == [0.0, 1.0]
+
+
 def test_the_depth_is_that_of_given_distances():
     # two samples of weights 1/2 and 1/4 at 1.1 and 2.4 in the intervals (1, 2) and (2, 3): (0.55 + 0.6) / 0.75
     density = torch.full((1, 2), math.log(2.0))

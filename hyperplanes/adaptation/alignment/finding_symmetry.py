@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from hyperplanes.adaptation.base import check_masks
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.symmetry.detection import possible_symmetries, symmetry_of
 from hyperplanes.geometry.symmetry.reflections import Symmetry
@@ -22,6 +23,7 @@ def find_symmetry(network: HyperPlanesNetwork, support: Views) -> Symmetry | Non
         network: the model.
         support: the views of an object.
     """
+    check_masks(support)
     config = network.config
     if config.symmetry is not None or not config.symmetric:
         return config.symmetry

@@ -42,7 +42,7 @@ class _Copies:
             _through(copied[[view]], camera.select(self.support.cameras, [source]), camera.select(cameras, [view]))
             for view, source in enumerate(nearest.tolist())
         ]
-        copied = torch.cat(parts)
+        copied = torch.cat(parts) if parts else copied
         return Pictures(copied[:, :3], copied[:, 3:], torch.zeros_like(copied[:, 3:]), 0)
 
 

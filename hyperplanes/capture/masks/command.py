@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hyperplanes.data.pictures.images import opacity_of, read_image
+from hyperplanes.data.pictures.images import read_mask
 from hyperplanes.utilities.files.encoding import encode_png
 from hyperplanes.utilities.files.reading import DataError
 
@@ -61,7 +61,9 @@ class Command:
                 word.replace("{image}", str(image)).replace("{mask}", str(mask)) for word in shlex.split(self.line)
             ]
             try:
-                done = subprocess.run(words, capture_output=True, text=True, timeout=LONGEST, check=False)
+                done = subprocess.run(
+                    words, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False
+                )
             except (OSError, subprocess.TimeoutExpired) as error:
                 raise ValueError(f"--mask: expected a program that runs, found {error}; check {self.line!r}") from error
             if done.returncode or not mask.is_file():
@@ -70,8 +72,7 @@ class Command:
                     f"--mask: expected a mask from {words[0]}, found exit code {done.returncode} and {said[0]!r}; "
                     "try the command on one photograph"
                 )
-            values, alpha = read_image(mask)
-        opacity = opacity_of(values, alpha)
+            opacity = read_mask(mask)
         if opacity.shape != picture.shape[:2]:
             found = f"{opacity.shape[1]} x {opacity.shape[0]}"
             size = f"{picture.shape[1]} x {picture.shape[0]} pixels"

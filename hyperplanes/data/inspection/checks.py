@@ -6,9 +6,11 @@ import torch
 
 from hyperplanes.data.inspection.conventions import FEWEST_MATCHES, LEAST_COVERAGE, RANDOM, near_lines
 from hyperplanes.data.inspection.matches import match_pictures
-from hyperplanes.data.inspection.silhouettes import coarse_hull, masks_tell, small_masks
-from hyperplanes.data.pictures.bounds import inverted, nearest_point
+from hyperplanes.data.inspection.silhouettes import coarse_hull, masks_tell, small_masks, with_object
+from hyperplanes.data.pictures.bounds import empty_masks, inverted, nearest_point
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.files.order import natural_order
+from hyperplanes.utilities.messages.errors import listed
 from hyperplanes.views import Views
 
 __all__ = ["check_duplicates", "check_gaze", "check_masks", "check_poses", "check_splits"]
@@ -48,9 +50,21 @@ def check_poses(views: Views) -> str | None:
 
 
 def check_masks(views: Views) -> str | None:
-    """A sentence where masks seem to show the background, otherwise None; the notes of the reader name them."""
-    wrong = 0 if views.masks is None else int(inverted(views.masks).sum())
-    return f"masks: WRONG, {wrong} of {len(views)} seem to show the background" if wrong else None
+    """A sentence where masks seem to show the background or are empty, otherwise None.
+
+    The notes of the reader name those that seem to show the background.
+    """
+    if views.masks is None:
+        return None
+    if wrong := int(inverted(views.masks).sum()):
+        return f"masks: WRONG, {wrong} of {len(views)} seem to show the background"
+    empty = empty_masks(views.masks).nonzero()[:, 0].tolist()
+    if not empty:
+        return None
+    names = listed(sorted((views.names[view] if views.names else str(view) for view in empty), key=natural_order))
+    return (
+        f"masks: WRONG, {len(empty)} of {len(views)} are empty ({names}); leave these views out or correct their masks"
+    )
 
 
 def check_gaze(views: Views) -> tuple[bool, str] | None:
@@ -83,7 +97,8 @@ def check_splits(support: Views, query: Views) -> tuple[bool, str]:
     Returns:
         False where they are clearly not, and a line that says what was compared.
     """
-    if len(support) >= 3 and masks_tell(support) and masks_tell(query):
+    if masks_tell(support) and masks_tell(query) and len(with_object(support)) >= 3:
+        support, query = with_object(support), with_object(query)
         masks, cameras = small_masks(support)
         hull = coarse_hull(masks, cameras)
         own, other = hull.coverage(masks, cameras), hull.coverage(*small_masks(query))

@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.data.inspection.matches import Matches, match_pictures
-from hyperplanes.data.inspection.silhouettes import coarse_hull, masks_tell, small_masks
+from hyperplanes.data.inspection.silhouettes import coarse_hull, masks_tell, small_masks, with_object
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.axes import flip_camera_axes
 from hyperplanes.views import Views
@@ -112,6 +112,7 @@ def check_conventions(views: Views) -> Conventions:
         return _by_pictures(views, "there are no masks")
     if not masks_tell(views):
         return _by_pictures(views, "the masks do not tell object and background apart")
+    views = with_object(views)
     if len(views) < FEWEST_VIEWS:
         return _by_pictures(views, f"fewer than {FEWEST_VIEWS} views are too few to compare masks")
     masks, cameras = small_masks(views)

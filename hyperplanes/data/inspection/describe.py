@@ -13,6 +13,7 @@ from hyperplanes.data.dataset import Dataset
 from hyperplanes.data.formats.catalogue import SPLITS
 from hyperplanes.data.inspection.checks import check_duplicates, check_gaze, check_masks, check_poses, check_splits
 from hyperplanes.data.inspection.conventions import Conventions, check_conventions
+from hyperplanes.data.inspection.silhouettes import with_object
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import carve
 from hyperplanes.utilities.files.reading import DataError
@@ -164,9 +165,11 @@ def _object(data: Dataset, name: str) -> ObjectDescription:
     extent = coverage = None
     if views.masks is not None:
         coverage = float(views.masks.mean())
-        hull = carve(views.masks, views.cameras, views.bounds, HULL_SIDE)
+        shown = with_object(views)
+        assert shown.masks is not None
+        hull = carve(shown.masks, shown.cameras, shown.bounds, HULL_SIDE)
         points = hull.centres()
-        if len(points):
+        if len(shown) and len(points):
             x, y, z = (points.amax(0) - points.amin(0) + hull.voxel).tolist()
             extent = (x, y, z)
     return ObjectDescription(

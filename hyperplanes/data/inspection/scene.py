@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from hyperplanes.data.formats.scenes.sparse_points import SparsePoints
-from hyperplanes.data.inspection.silhouettes import CoarseHull, masks_tell, small_masks
-from hyperplanes.data.pictures.bounds import cut_off, inverted
+from hyperplanes.data.inspection.silhouettes import CoarseHull, masks_tell, small_masks, with_object
+from hyperplanes.data.pictures.bounds import cut_off, empty_masks, inverted
 from hyperplanes.data.upright import guess_up, upright
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
@@ -79,6 +79,7 @@ class SceneReport:
         masked: whether the views have masks.
         inverted: how many of these seem to show the background.
         contradicted: whether pictures and poses contradict each other (`conventions.check_conventions`).
+        empty: how many masks show nothing.
     """
 
     views: tuple[ViewReport, ...]
@@ -92,6 +93,7 @@ class SceneReport:
     masked: bool = True
     inverted: int = 0
     contradicted: bool = False
+    empty: int = 0
 
     @property
     def worst(self) -> list[ViewReport]:
@@ -144,6 +146,11 @@ class SceneReport:
                 f"poor pictures: {self.inverted} of {len(self.views)} masks seem to show the background; invert them, "
                 "white is the object"
             )
+        if self.empty:
+            return (
+                f"poor pictures: {self.empty} of {len(self.views)} masks show nothing; leave these views out or "
+                "correct their masks"
+            )
         if self.contradicted:
             return "poor pictures: poses and images contradict each other; see the conventions above"
         unseen = [side for side, share in (("above", self.above), ("below", self.below)) if share < 0.25]
@@ -188,6 +195,7 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
     sharp = _sharpness(views, apart)
     cut = cut_off(views.masks) if views.masks is not None else torch.zeros(len(views), dtype=torch.bool)
     background = inverted(views.masks) if views.masks is not None else torch.zeros_like(cut)
+    empty = empty_masks(views.masks) if views.masks is not None else torch.zeros_like(cut)
     cut &= ~background
     errors: Mapping[str, float] = {} if sparse is None else sparse.errors
     usual = median(errors.values()) if errors else None
@@ -195,7 +203,8 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
     for index, name in enumerate(names):
         fit = None if agreement is None else float(agreement[index])
         faults = ["the mask seems to show the background"] if background[index] else []
-        if not background[index] and fit is not None and middle is not None and fit < middle - UNLIKE:
+        faults += ["the mask is empty"] if empty[index] else []
+        if not faults and fit is not None and middle is not None and fit < middle - UNLIKE:
             faults.append(f"mask and the hull of all masks agree by {fit:.0%}, in the median {middle:.0%}")
         if float(sharp[index]) < BLURRED:
             faults.append(f"blurred, {float(sharp[index]):.0%} as sharp as the views beside it")
@@ -223,6 +232,7 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
         sparse,
         views.masks is not None,
         int(background.sum()),
+        empty=int(empty.sum()),
     )
 
 
@@ -268,6 +278,7 @@ def _hull(views: Views) -> Occupancy | None:
     """The hull of all masks but for what only one of them rules out; None without masks."""
     if not masks_tell(views):
         return None
+    views = with_object(views)
     hull = carve(*small_masks(views, MASK, len(views)), views.bounds, SIDE, votes=2 if len(views) >= FEWEST else 1)
     return hull if hull.occupied.any() else None
 
@@ -284,8 +295,9 @@ def _shown(views: Views, hull: Occupancy) -> Float[Tensor, " place"]:
     count = torch.zeros(len(places))
     for eye, matrix in zip(eyes, camera.projection_matrices(views.cameras), strict=True):
         seen = places @ matrix[:, :3].T + matrix[:, 3]
-        column, row = (seen[:, :2] / seen[:, 2:].clamp_min(1e-6)).unbind(-1)
-        inside = (seen[:, 2] > 0) & (column > 0) & (row > 0) & (column < width - 1) & (row < height - 1)
+        front = seen[:, 2] > 0
+        column, row = (seen[:, :2] / torch.where(front, seen[:, 2], 1.0)[:, None]).unbind(-1)
+        inside = front & (column > 0) & (row > 0) & (column < width - 1) & (row < height - 1)
         facing: Bool[Tensor, " place"] = (normalize(eye - places, dim=-1) * normals).sum(-1) > FACING
         count += inside & facing
     return count

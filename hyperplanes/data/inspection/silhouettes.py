@@ -10,13 +10,13 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from hyperplanes.data.pictures.bounds import OFTEN_CUT, ROOM, are_shown, cut_off, estimate_bounds
+from hyperplanes.data.pictures.bounds import OFTEN_CUT, ROOM, are_shown, cut_off, empty_masks, estimate_bounds
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Views
 
-__all__ = ["CoarseHull", "coarse_hull", "masks_tell", "silhouettes", "small_masks"]
+__all__ = ["CoarseHull", "coarse_hull", "masks_tell", "silhouettes", "small_masks", "with_object"]
 
 SIDE = 32
 MASK = 64
@@ -94,6 +94,14 @@ def coarse_hull(masks: Float[Tensor, "view 1 height width"], cameras: PinholeCam
 def masks_tell(views: Views) -> bool:
     """Whether there are masks, and they say where the object is."""
     return views.masks is not None and 0 < float((views.masks > 0).float().mean()) < 0.95
+
+
+def with_object(views: Views) -> Views:
+    """The views whose masks are not empty; all where there are no masks."""
+    if views.masks is None:
+        return views
+    empty = empty_masks(views.masks)
+    return views[~empty] if empty.any() else views
 
 
 def small_masks(

@@ -19,9 +19,11 @@ from hyperplanes.utilities.files.reading import DataError
 
 __all__ = [
     "OFTEN_CUT",
+    "ONE_PLACE",
     "ROOM",
     "are_shown",
     "cut_off",
+    "empty_masks",
     "estimate_bounds",
     "inverted",
     "nearest_point",
@@ -38,6 +40,8 @@ BORDER = 0.9  # of the pixels at the image border, which an inverted mask covers
 SMALLEST = 0.01  # least share of an image that an object covers, for its mask to be recognised as inverted
 OFTEN_CUT = 0.1  # of the masks: a larger share at the border of their image counts as a scene of close-ups
 ROOM = 3.0  # radii of the sphere from the cameras: where the hull of such a scene is searched
+SMALLEST_DISTANCE = 1e-6  # of a camera from the centre, in units of the largest distance of one from their mean
+ONE_PLACE = 2.0**-21  # of the distance from the origin: float32 rounding moves cameras at one position this far apart
 WHOLE, SHOWN = 0.9, 0.25  # of the images that show the object whole, or of all images, that must show a point
 
 
@@ -62,7 +66,8 @@ def estimate_bounds(
     close-ups, the object may be larger than the sphere from the cameras. The hull is then carved in a sphere three
     times as large, and only its points that `are_shown` accepts count.
 
-    Masks of cameras with lens distortion are not used; the result is then the sphere from the cameras.
+    Empty masks are not used: one that is empty by mistake would remove the whole object from the hull. Masks of cameras
+    with lens distortion are not used either; the result is then the sphere from the cameras.
 
     Args:
         cameras: of one scene.
@@ -72,6 +77,10 @@ def estimate_bounds(
     outer = _from_cameras(cameras, depths)
     if alpha is None or isinstance(cameras, DistortedCamera) or len(alpha) < FEWEST_MASKS or not alpha.any():
         return outer
+    if (empty := empty_masks(alpha)).any():
+        alpha, cameras = alpha[~empty], camera.select(cameras, ~empty)
+        if len(alpha) < FEWEST_MASKS:
+            return outer
     chosen = torch.linspace(0, len(alpha) - 1, min(len(alpha), MOST_MASKS)).round().long()
     masks, small = _reduced(alpha[chosen], camera.select(cameras, chosen))
     ends = cut_off(masks)
@@ -100,6 +109,13 @@ def cut_off(
     opaque = masks[:, 0] > 0
     sides = [opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]]
     return torch.cat(sides, -1).any(-1)
+
+
+def empty_masks(
+    masks: Float[Tensor, "view 1 height width"] | UInt8[Tensor, "view 1 height width"],
+) -> Bool[Tensor, " view"]:
+    """Which masks show nothing. No hull that other masks show agrees with one whose camera looks at the object."""
+    return masks.flatten(1).amax(1) == 0
 
 
 def inverted(
@@ -139,8 +155,9 @@ def are_shown(
     count = torch.zeros(len(points), dtype=torch.long)
     for matrix in matrices:
         seen = points @ matrix[:, :3].T + matrix[:, 3]
-        column, row = (seen[:, :2] / seen[:, 2:].clamp_min(1e-6)).unbind(-1)
-        count += (seen[:, 2] > 1e-6) & (column > 0) & (row > 0) & (column < width - 1) & (row < height - 1)
+        front = seen[:, 2] > 0
+        column, row = (seen[:, :2] / torch.where(front, seen[:, 2], 1.0)[:, None]).unbind(-1)
+        count += front & (column > 0) & (row > 0) & (column < width - 1) & (row < height - 1)
     return count >= max(2.0, (WHOLE if whole else SHOWN) * len(matrices))
 
 
@@ -183,7 +200,8 @@ def _from_cameras(cameras: PinholeCamera, depths: Tensor | None) -> Sphere:
     eyes, axes = camera.centres(cameras), camera.viewing_directions(cameras)
     centre = nearest_point(eyes, axes)
     if depths is not None and _look_past_it(centre, eyes, axes, depths):
-        middle = 2 / (1 / depths.to(eyes).clamp_min(1e-6)).sum(1, keepdim=True)  # the mean in disparity
+        tiny = torch.finfo(eyes.dtype).tiny
+        middle = 2 / (1 / depths.to(eyes).clamp_min(tiny)).sum(1, keepdim=True)  # the mean in disparity
         centre = (eyes + axes * middle).median(0).values
     distance = (eyes - centre).norm(dim=-1)
     height, width = camera.image_size(cameras)
@@ -191,7 +209,10 @@ def _from_cameras(cameras: PinholeCamera, depths: Tensor | None) -> Sphere:
     half = torch.atan(focal.new_tensor([width / 2, height / 2]) / focal).amin(-1)
     radius = float((distance * half.sin()).median())
     nearest = float(distance.min())
-    if nearest < 1e-6 or radius < 1e-6:  # all cameras in one position: the point a unit ahead of them
+    # all cameras in one position, up to the rounding of float32: the point a unit ahead of them
+    spread = float((eyes - eyes.mean(0)).norm(dim=-1).max())
+    least = max(SMALLEST_DISTANCE * spread, ONE_PLACE * float(eyes.norm(dim=-1).max()))
+    if min(nearest, radius) <= least:
         return Sphere(tuple((eyes + axes).mean(0).tolist()), 1.0)
     return Sphere(tuple(centre.tolist()), min(radius, 0.95 * nearest))
 

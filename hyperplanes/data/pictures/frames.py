@@ -17,11 +17,12 @@ from hyperplanes.data.pictures.images import (
     check_downscale,
     image_header,
     image_size,
-    opacity_of,
     read_image,
+    read_mask,
     reduced,
     resized,
     turned,
+    without_haze,
 )
 from hyperplanes.data.pictures.posed import Posed, posed
 from hyperplanes.data.pictures.undistort import check_lens, undistort
@@ -286,7 +287,9 @@ def _pixels(one: _Found, size: tuple[int, int], factor: int) -> tuple[Pixels, bo
                 f"{stored[1]} x {stored[0]}",
                 "scale the mask to the size of its image",
             )
-        values, has_alpha = read_image(one.frame.mask, stored)
-        picture[..., 3] = opacity_of(values if stored == one.size else turned(values, one.turn), has_alpha)
+        opacity = read_mask(one.frame.mask, stored)
+        picture[..., 3] = opacity if stored == one.size else turned(opacity, one.turn)
         alpha = True
+    elif alpha:
+        picture[..., 3] = without_haze(picture[..., 3])
     return reduced(resized(picture, size), factor), alpha

@@ -14,6 +14,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import TiffImageFile
 from torch import Tensor
 
+from hyperplanes.geometry.occupancy import MIN_MASK_OPACITY
 from hyperplanes.utilities.files.reading import DataError, check_regular
 
 __all__ = [
@@ -29,9 +30,11 @@ __all__ = [
     "image_size",
     "opacity_of",
     "read_image",
+    "read_mask",
     "reduced",
     "resized",
     "turned",
+    "without_haze",
 ]
 
 LARGEST_IMAGE = 64 * 10**6
@@ -138,9 +141,9 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> tuple[n
     """The pixels of an image.
 
     Args:
-        path: a file in one of FORMATS. More than 8 bits per channel are scaled down to 8. In a floating-point image,
-            white is the first of 1, 255 and 65535 that no value exceeds by more than half, since resampled masks
-            exceed white.
+        path: a file in one of FORMATS. More than 8 bits per channel are scaled down to 8, except that 0 and 1 stay 0
+            and 1 if all integers of an image are. In a floating-point image, white is the first of 1, 255 and 65535
+            that no value exceeds by more than half, since resampled masks exceed white.
         size: the (height, width) that it must have, checked before decoding.
 
     Returns:
@@ -172,7 +175,7 @@ def opacity_of(mask: Pixels, has_alpha: bool) -> UInt8[np.ndarray, "height width
     """The opacity that an image of a mask states: its alpha if some pixel is not opaque, otherwise its largest channel.
 
     So the mask may also be a photograph whose background is transparent. If the largest value is 1, 1 marks the object
-    and becomes 255.
+    and becomes 255. Otherwise values below MIN_MASK_OPACITY become 0 (`without_haze`).
 
     Args:
         mask: (height, width, 4), as `read_image` returns it.
@@ -180,7 +183,41 @@ def opacity_of(mask: Pixels, has_alpha: bool) -> UInt8[np.ndarray, "height width
     """
     by_alpha = has_alpha and bool((mask[..., 3] < 255).any())
     opacity = mask[..., 3] if by_alpha else mask[..., :3].max(-1)
-    return opacity * np.uint8(255) if opacity.max() == 1 else opacity
+    return opacity * np.uint8(255) if opacity.max() == 1 else without_haze(opacity)
+
+
+def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width"]:
+    """The opacity that the file of a mask states, as `opacity_of` says.
+
+    A palette with colours means labels, as in the masks of PASCAL VOC, YouTube-VOS and DAVIS: label 0 is the background
+    and all others are opaque. A palette of greys gives the opacity.
+
+    Args:
+        path: as in `read_image`.
+        size: as in `read_image`.
+
+    Returns:
+        8 bits, 255 where the object is. Raises DataError as `read_image` does.
+    """
+    values, has_alpha = read_image(path, size)
+    if not has_alpha and (values[..., :1] != values[..., 1:3]).any():
+        with _open(Path(path)) as image:
+            if image.mode == "P":
+                return np.where(np.asarray(image) > 0, np.uint8(255), np.uint8(0))
+    return opacity_of(values, has_alpha)
+
+
+def without_haze(opacity: Pixels) -> Pixels:
+    """8-bit opacity with 0 in place of values below MIN_MASK_OPACITY.
+
+    A hull treats every value above 0 as a part of the object, and many programs that cut objects out leave 1 or 2 of
+    255 all over the background. The values are replaced where files are read, before images are scaled down: the mean
+    of an edge and its background may be smaller, and does belong to the object.
+
+    >>> without_haze(np.array([0, 2, 7, 8, 255], np.uint8)).tolist()
+    [0, 0, 0, 8, 255]
+    """
+    return np.where(opacity < 255 * MIN_MASK_OPACITY, np.uint8(0), opacity)
 
 
 def composite_over_white(
@@ -203,7 +240,7 @@ def composite_over_white(
 def _white(mode: str, largest: float) -> float:
     """The value of white in an image of one of Pillow's modes with more than 8 bits, by its largest value."""
     if mode != "F":
-        return max(65535.0, largest)
+        return 255.0 if largest == 1 else max(65535.0, largest)  # zeros and ones of a mask stay as they are
     return next((white for white in (1.0, 255.0, 65535.0) if largest <= _OVERSHOOT * white), largest)
 
 

@@ -46,7 +46,9 @@ def find_commit() -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     def ask(*words: str) -> str:
-        answer = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+        answer = subprocess.run(
+            ["git", *words], cwd=ROOT, capture_output=True, text=True, errors="surrogateescape", check=False
+        )
         return answer.stdout.strip()
 
     try:

@@ -104,6 +104,7 @@ def test_an_unknown_name_is_refused():
     [
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "crashed with signal 11"),
         ("import sys; print('long story', file=sys.stderr); sys.exit('last word')", "last word"),
+        ("import sys; sys.stderr.buffer.write(b'caf\\xe9'); sys.exit(1)", "caf\ufffd"),
         ("import sys; sys.exit(3)", "exit code 3"),
         ("pass", "exit code 0"),
     ],

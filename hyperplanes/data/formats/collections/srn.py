@@ -12,7 +12,7 @@ from hyperplanes.data.formats.catalogue import SPLITS, Catalogue
 from hyperplanes.data.formats.text_numbers import read_numbers, read_rows
 from hyperplanes.data.pictures.bounds import stated_bounds
 from hyperplanes.data.pictures.frames import scaled_matrix
-from hyperplanes.data.pictures.images import image_size, read_image
+from hyperplanes.data.pictures.images import image_size, read_image, without_haze
 from hyperplanes.data.pictures.posed import Posed, PosedTask, check_pose, posed
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.axes import invert_poses
@@ -54,6 +54,9 @@ def read_srn(folder: Path, root: Path, bounds: Sphere | None = None) -> Posed:
     pixels = [read_image(path, size) for path in pictures]
     rgba = [picture for picture, _ in pixels]
     alpha = any(has_alpha and (picture[..., 3] < 255).any() for picture, has_alpha in pixels)
+    if alpha:
+        for picture in rgba:
+            picture[..., 3] = without_haze(picture[..., 3])
     # objects rendered over white, without alpha: exactly white pixels are background
     if not alpha and all(_white_border(picture) for picture in rgba):
         alpha = True
