@@ -18,6 +18,7 @@ from hyperplanes.geometry.inputs import Selection, as_selection, check_channels_
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.utilities.images.image_range import check_image_range
+from hyperplanes.utilities.images.sizes import scaled_size
 from hyperplanes.utilities.messages.arguments import checked, kind_of
 
 __all__ = ["Classified", "Task", "Tasks", "Views", "class_of", "join_views", "moved"]
@@ -117,10 +118,9 @@ class Views:
         """The views scaled down so that the longer side has `longest` pixels; smaller views stay unchanged."""
         if longest < 1:
             raise ValueError(f"longest: expected at least 1 pixel, got {longest}")
-        scale = longest / max(self.size)
-        if scale >= 1:
+        size = scaled_size(self.size, longest)
+        if size == self.size:
             return self
-        size = max(1, round(self.size[0] * scale)), max(1, round(self.size[1] * scale))
         if not len(self):  # no cameras have no size, and `interpolate` refuses no images
             empty = (
                 None if each is None else each.new_zeros(0, each.shape[1], *size) for each in (self.images, self.masks)

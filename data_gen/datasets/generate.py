@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -99,21 +100,14 @@ def generate(
         What was written and what was skipped.
 
     Raises:
-        ValueError: an argument that makes no sense, a renderer that does not work, no object that could be drawn.
-        DataError: the folder holds something else, or the disk is full.
+        ValueError: an argument that makes no sense, a renderer that does not work, no object that could be drawn; as
+            DataError, a folder that holds something else, or a full disk.
     """
     begun = time.monotonic()
     out, config = Path(out), config or GenerationConfig()
     check(source, config)
     render = config.resolve()
-
-    def reason_against(folder: Path) -> str | None:
-        if out.exists() and folder.samefile(out):
-            return ""
-        written = holds_data_set(folder)
-        return "expected meshes, found a data set of hyperplanes generate; give its folder alone" if written else None
-
-    listing = list_items(source, config.held_out, reason_against)
+    listing = list_items(source, config.held_out, partial(_reason_against, out))
     items = listing.items
     classes = sorted({item.class_name for item in items}, key=str)
     for class_name in classes:
@@ -127,23 +121,19 @@ def generate(
         reused = len(listed) - len(changed)
         pending = (asdict(item) for item in items if item.name not in done)
         settings = {"out": str(out.resolve()), "render": render.as_json(), "meshes": meshes}
-        count, skipped, images = reused, [], 0
-        try:
-            with closing(_outcomes(config, settings, pending)) as outcomes:
-                for outcome in outcomes:
-                    count += 1
-                    name = outcome.item["name"]
-                    if outcome.result is None:
-                        skipped.append((name, _without_path(str(outcome.reason), source)))
-                        if name in changed:
-                            state.remove(changed[name])
-                    else:
-                        done[name] = outcome.result
-                        images += outcome.result["record"]["views"]
-                    if progress is not None:
-                        progress(count, len(items), name)
-        except WorkerError as error:
-            raise DataError(str(error)) from error
+        skipped, images = [], 0
+        with closing(_outcomes(config, settings, pending)) as outcomes:
+            for count, outcome in enumerate(outcomes, reused + 1):
+                name = outcome.item["name"]
+                if outcome.result is None:
+                    skipped.append((name, _without_path(str(outcome.reason), source)))
+                    if name in changed:
+                        state.remove(changed[name])
+                else:
+                    done[name] = outcome.result
+                    images += outcome.result["record"]["views"]
+                if progress is not None:
+                    progress(count, len(items), name)
         kept = [item for item in items if item.name in done]
         if not kept:
             name, reason = skipped[0]
@@ -173,6 +163,14 @@ def generate(
         changed=list(changed),
         duplicates=[name for name, _ in listing.duplicates],
     )
+
+
+def _reason_against(out: Path, folder: Path) -> str | None:
+    """Why a folder is not searched for meshes: a reason for the user, "" for the folder of this data set, or None."""
+    if out.exists() and folder.samefile(out):
+        return ""
+    written = holds_data_set(folder)
+    return "expected meshes, found a data set of hyperplanes generate; give its folder alone" if written else None
 
 
 def _configuration(
@@ -229,10 +227,15 @@ def _facts(render: GenerationConfig, classes: list[str | None]) -> dict[str, Any
 def _outcomes(
     config: GenerationConfig, settings: dict[str, Any], items: Iterator[dict[str, Any]]
 ) -> Generator[Outcome, None, None]:
+    """What the workers make of the items, in order of completion; DataError if they can process none."""
     limits = {"timeout": config.timeout, "recycle": config.recycle}
-    if config.engine == "ray":
-        from data_gen.datasets.ray_cluster import run_on_ray
+    try:
+        if config.engine == "ray":
+            from data_gen.datasets.ray_cluster import run_on_ray
 
-        return run_on_ray(TARGET, settings, items, workers=config.workers, **limits)
-    workers = usable_cores() if config.workers is None else config.workers
-    return run_isolated(TARGET, settings, items, workers=workers, **limits)
+            yield from run_on_ray(TARGET, settings, items, workers=config.workers, **limits)
+        else:
+            workers = usable_cores() if config.workers is None else config.workers
+            yield from run_isolated(TARGET, settings, items, workers=workers, **limits)
+    except WorkerError as error:
+        raise DataError(str(error)) from error

@@ -148,47 +148,26 @@ def run_workers(
             alive.add(worker)
             return worker
 
-    def close_worker(worker: Worker, *, kill: bool) -> None:
-        if kill:
-            worker.kill()
+    def close_worker(worker: Worker) -> None:
         worker.stop()
         with lock:
             alive.discard(worker)
 
     def serve() -> None:
-        worker, left = None, 0
+        current = _Current(open_worker, close_worker, recycle)
         try:
             while free.acquire() and not stopping.is_set():
                 with lock:
                     item = next(pending, None)
                 if item is None:
                     break
-                answer: dict[str, Any] = {}
-                for attempt in range(1, ATTEMPTS + 1):
-                    if worker is None:
-                        worker, left = open_worker(), recycle
-                    try:
-                        answer = worker.process(item)
-                        break
-                    except WorkerLost as error:
-                        close_worker(worker, kill=True)
-                        worker, answer = None, {"skip": f"failed {attempt} times: {error}"}
-                        if isinstance(error, WorkerTimeout):
-                            answer = {"skip": f"{error}; simplify it, or allow more by --timeout"}
-                            break
-                if "fatal" in answer:
-                    raise WorkerError(answer["fatal"])
-                left -= 1
-                if worker is not None and left <= 0:
-                    close_worker(worker, kill=False)
-                    worker = None
+                answer = current.process(item)
                 ended.put(Outcome(item, answer.get("ok"), answer.get("skip")))
         except Exception as error:
             ended.put(error)
         finally:
             free.release()  # for the other threads, which must also see the end of the items
-            if worker is not None:
-                close_worker(worker, kill=stopping.is_set())
+            current.close(kill=stopping.is_set())
             ended.put(None)
 
     threads = [threading.Thread(target=serve, daemon=True) for _ in range(count)]
@@ -213,6 +192,45 @@ def run_workers(
         free.release(count)
         for thread in threads:
             thread.join()
+
+
+class _Current:
+    """The worker of a thread, replaced by a new one when it is lost or has processed `recycle` items."""
+
+    def __init__(self, open_worker: Callable[[], Worker], close_worker: Callable[[Worker], None], recycle: int) -> None:
+        self._open, self._close, self._recycle = open_worker, close_worker, recycle
+        self._worker: Worker | None = None
+        self._left = 0
+
+    def process(self, item: dict[str, Any]) -> dict[str, Any]:
+        answer = self._answer(item)
+        if "fatal" in answer:
+            raise WorkerError(answer["fatal"])
+        self._left -= 1
+        if self._left <= 0:
+            self.close(kill=False)
+        return answer
+
+    def _answer(self, item: dict[str, Any]) -> dict[str, Any]:
+        answer: dict[str, Any] = {}
+        for attempt in range(1, ATTEMPTS + 1):
+            if self._worker is None:
+                self._worker, self._left = self._open(), self._recycle
+            try:
+                return self._worker.process(item)
+            except WorkerLost as error:
+                self.close(kill=True)
+                if isinstance(error, WorkerTimeout):
+                    return {"skip": f"{error}; simplify it, or allow more by --timeout"}
+                answer = {"skip": f"failed {attempt} times: {error}"}
+        return answer
+
+    def close(self, *, kill: bool) -> None:
+        if self._worker is not None:
+            if kill:
+                self._worker.kill()
+            self._close(self._worker)
+            self._worker = None
 
 
 class _ProcessWorker:

@@ -33,6 +33,7 @@ from data_gen.meshes.materials import (
     texture_of,
     visual_of,
 )
+from hyperplanes.utilities.images.sizes import scaled_size
 
 __all__ = [
     "COINCIDENT",
@@ -305,12 +306,9 @@ def _texels(image: Any, images: dict[Any, Any], *, keep_alpha: bool) -> npt.NDAr
     """Premultiplied RGBA of a PIL image; equal images of an object share an array."""
     if image is None:
         return None
-    rgba = image.convert("RGBA" if keep_alpha else "RGB").convert("RGBA")
+    rgba = _premultiplied(image.convert("RGBA" if keep_alpha else "RGB").convert("RGBA"))
     if max(rgba.size) > MAX_TEXTURE_SIDE:
-        scale = MAX_TEXTURE_SIDE / max(rgba.size)
-        rgba = _premultiplied(rgba).resize([max(1, round(side * scale)) for side in rgba.size], Image.Resampling.BOX)
-    else:
-        rgba = _premultiplied(rgba)
+        rgba = rgba.resize(scaled_size(rgba.size, MAX_TEXTURE_SIDE), Image.Resampling.BOX)
     key = (rgba.size, rgba.tobytes())
     return images.setdefault(key, np.asarray(rgba))
 

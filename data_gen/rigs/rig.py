@@ -40,16 +40,16 @@ class Rig:
 
     Attributes:
         world_from_camera: camera poses `(view, 4, 4)`, OpenCV axes, in world units.
-        intrinsics: pinhole matrices `(view, 3, 3)` in pixels, integer pixel centres. One `(3, 3)` is accepted and
-            repeated for every view.
+        intrinsics: pinhole matrices `(view, 3, 3)` without skew, in pixels, integer pixel centres. One `(3, 3)` is
+            accepted and repeated for every view.
         width: image width in pixels.
         height: image height in pixels.
         near: distance along a ray before which there is no object, in world units.
         far: distance along a ray beyond which there is no object, in world units.
 
     Raises:
-        ValueError: if a shape is wrong, a number is not finite, a pose is not a rigid motion, or near and far are out
-            of order.
+        ValueError: if a shape is wrong, a number is not finite, a camera has skew, a pose is not a rigid motion, or
+            near and far are out of order.
     """
 
     world_from_camera: Array
@@ -69,6 +69,8 @@ class Rig:
         intrinsics = np.array(np.broadcast_to(intrinsics, (len(poses), 3, 3)))
         if not (np.isfinite(poses).all() and np.isfinite(intrinsics).all()):
             raise ValueError("world_from_camera, intrinsics: expected finite numbers, got NaN or infinity")
+        if (skew := intrinsics[:, 0, 1]).any():  # neither OpenGL's projection nor a transforms.json has any
+            raise ValueError(f"intrinsics: expected no skew, got {skew[skew != 0][0]:g}")
         rotations = poses[:, :3, :3]
         error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
         if error > 1e-6 or np.linalg.det(rotations).min() < 0:

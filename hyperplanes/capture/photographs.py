@@ -30,6 +30,7 @@ from hyperplanes.data.pictures.images import (
 from hyperplanes.data.pictures.masks import match_masks
 from hyperplanes.utilities.files.order import natural_order
 from hyperplanes.utilities.files.reading import DataError
+from hyperplanes.utilities.images.sizes import scaled_size
 from hyperplanes.utilities.messages.errors import listed
 from hyperplanes.utilities.messages.formatting import counted
 
@@ -202,16 +203,6 @@ def read_upright(
         return np.ascontiguousarray(np.rot90(scaled)) if photograph.turned else scaled
 
     return stored_as(np.ascontiguousarray(rgba[..., :3])), None if opacity is None else stored_as(opacity)
-
-
-def scaled_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
-    """(height, width) scaled down so that the longer side has at most `max_size` pixels.
-
-    >>> scaled_size((3000, 4000), 1000)
-    (750, 1000)
-    """
-    factor = min(1.0, max_size / max(size))
-    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 
 def _same_shape(size: tuple[int, ...], other: tuple[int, ...]) -> bool:

@@ -27,7 +27,7 @@ Example:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
@@ -50,9 +50,13 @@ from hyperplanes.commands.output.writing import check_output
 from hyperplanes.utilities.messages.formatting import counted
 
 if TYPE_CHECKING:
+    import torch
+
     from hyperplanes.data import Dataset
+    from hyperplanes.data.devices import TasksOnDevice
     from hyperplanes.evaluation import Score
     from hyperplanes.evaluation.comparison import Comparison
+    from hyperplanes.methods import WithSampler
     from hyperplanes.views import Tasks, Views
 
 __all__ = ["Arguments", "run", "with_seed"]
@@ -161,58 +165,20 @@ def rows_of(method: str, steps: Sequence[int]) -> list[str]:
 def run(arguments: Arguments) -> int:
     """Evaluate all methods, print the table and write what was asked for."""
     from hyperplanes.adaptation.checkpoints import find_checkpoints
-    from hyperplanes.adaptation.fine_tuned import FineTuned
-    from hyperplanes.configuration.fine_tuning import FineTuning
-    from hyperplanes.configuration.presets import PROTOCOLS
-    from hyperplanes.data import open_dataset
-    from hyperplanes.data.devices import TasksOnDevice, choose_device
+    from hyperplanes.data.devices import choose_device
     from hyperplanes.evaluation import evaluate_all
     from hyperplanes.evaluation.comparison import compare_all
     from hyperplanes.evaluation.figures import PictureGrid
     from hyperplanes.evaluation.partial_results import PartialResults
     from hyperplanes.evaluation.perceptual import LPIPS
-    from hyperplanes.evaluation.tables import PAIR_HEADINGS, compared_rows, headings, rows
-    from hyperplanes.methods import Request, WithSampler, make_method
     from hyperplanes.utilities.messages.errors import listed
 
     _check(arguments)
     console, device = Console(), choose_device(arguments.device)
     checkpoints = [find_checkpoints(with_seed(arguments.checkpoint, seed)) for seed in range(arguments.seeds)]
-    opened = open_dataset(arguments.data, legacy=arguments.legacy)
-    for line in opened.skipped:
-        console.warn(line)
-    up = _up(arguments, opened, console)
-    data = [TasksOnDevice(_tasks(arguments, opened, seed), device, up) for seed in range(arguments.seeds)]
-    names = opened.names(arguments.split)[: arguments.objects]
-    if not names:
-        raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
-    sampling = PROTOCOLS[arguments.protocol]
+    data, names = _opened(arguments, device, console)
     lpips = None if arguments.lpips is None else LPIPS(arguments.lpips, device)
-
-    chosen = list(dict.fromkeys(row for name in arguments.method for row in rows_of(name, arguments.steps)))
-    named = {
-        (row, seed): find_checkpoints(with_seed([Path(row.partition(AT)[2])], seed))
-        for row in chosen
-        for seed in range(arguments.seeds)
-        if AT in row
-    }
-
-    def make(row: str, seed: int) -> WithSampler:
-        name = row.partition(AT)[0]
-        objects = _supports(data[seed], names)
-        request = Request(
-            name,
-            named.get((row, seed), checkpoints[seed]),
-            device=device,
-            settings=FineTuning(trainable=arguments.fine_tune, seed=seed),
-            objects=objects,
-            preset=arguments.preset,
-            protocol=arguments.protocol,
-        )
-        return WithSampler(make_method(request), sampling)
-
-    first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to
-    check_fine_tune(arguments.fine_tune, sum(isinstance(made.adapter, FineTuned) for made in first.values()))
+    methods = _methods(arguments, checkpoints, data, names, device)
     pictures, failures, kept = PictureGrid(), {}, PartialResults(arguments.json)
 
     def failed(method: str, seed: int, name: str, error: Exception) -> None:
@@ -221,7 +187,7 @@ def run(arguments: Arguments) -> int:
 
     with console.bar("evaluating") as bar:
         scores = evaluate_all(
-            {name: lambda seed, name=name: make(name, seed) if seed else first[name] for name in chosen},
+            methods,
             data,
             names,
             bar.show,
@@ -231,15 +197,8 @@ def run(arguments: Arguments) -> int:
             on_failure=failed if len(names) > 1 else None,
             lpips=lpips,
         )
-    pairs, count = compare_all(scores), len(scores[0].objects)
-    console.table(headings(scores), rows(scores))
-    if count > 1 and pairs:
-        console.table(PAIR_HEADINGS, compared_rows(pairs[:LARGEST_TABLE]))
-        if (more := len(pairs) - LARGEST_TABLE) > 0:
-            console.say(f"{counted(more, 'more pair')} with smaller differences: --markdown FILE writes all of them")
-    console.say(f"{counted(count, 'object')} of {arguments.data}{_of_seeds(arguments)}")
-    if line := _of_shown(scores):
-        console.warn(line)
+    pairs = compare_all(scores)
+    _show(arguments, scores, pairs, console)
     _write(arguments, scores, pairs)
     if arguments.grid is not None:
         pictures.save(arguments.grid)
@@ -247,14 +206,12 @@ def run(arguments: Arguments) -> int:
     for option in OUTPUTS:
         if (path := getattr(arguments, option)) is not None:
             console.say(f"written: {path}")
-    missing = [name for name in chosen if name not in {score.method for score in scores}]
+    missing = [name for name in methods if name not in {score.method for score in scores}]
     if missing:
         console.warn(f"methods that failed on every object and are not in the table: {', '.join(missing)}")
-    if len(names) > count:
-        shown = {each.name for each in scores[0].objects}
-        console.warn(
-            f"{len(names) - count} of {len(names)} objects are left out: {listed([n for n in names if n not in shown])}"
-        )
+    shown = {each.name for each in scores[0].objects}
+    if left_out := [name for name in names if name not in shown]:
+        console.warn(f"{len(left_out)} of {len(names)} objects are left out: {listed(left_out)}")
     return int(bool(failures))
 
 
@@ -292,6 +249,76 @@ def _check(arguments: Arguments) -> None:
         raise ValueError(f"--inputs: expected neither --support nor --choose with it, got {given}; leave one out")
     if arguments.support is None and arguments.choose != "first":
         raise ValueError(f"--choose {arguments.choose}: expected --support as well, got none; add a number of views")
+
+
+def _opened(arguments: Arguments, device: torch.device, console: Console) -> tuple[list[TasksOnDevice], Sequence[str]]:
+    """The data set of each seed, and the names of the objects to evaluate."""
+    from hyperplanes.data import open_dataset
+    from hyperplanes.data.devices import TasksOnDevice
+
+    opened = open_dataset(arguments.data, legacy=arguments.legacy)
+    for line in opened.skipped:
+        console.warn(line)
+    up = _up(arguments, opened, console)
+    data = [TasksOnDevice(_tasks(arguments, opened, seed), device, up) for seed in range(arguments.seeds)]
+    names = opened.names(arguments.split)[: arguments.objects]
+    if not names:
+        raise ValueError(f"{arguments.data}: expected objects in its {arguments.split} split, found none; see --split")
+    return data, names
+
+
+def _methods(
+    arguments: Arguments,
+    checkpoints: Sequence[Mapping[str, Path]],
+    data: Sequence[Tasks],
+    names: Sequence[str],
+    device: torch.device,
+) -> dict[str, Callable[[int], WithSampler]]:
+    """By the name of each row, a function that makes its method from a seed."""
+    from hyperplanes.adaptation.checkpoints import find_checkpoints
+    from hyperplanes.adaptation.fine_tuned import FineTuned
+    from hyperplanes.configuration.fine_tuning import FineTuning
+    from hyperplanes.configuration.presets import PROTOCOLS
+    from hyperplanes.methods import Request, WithSampler, make_method
+
+    chosen = list(dict.fromkeys(row for name in arguments.method for row in rows_of(name, arguments.steps)))
+    named = {
+        (row, seed): find_checkpoints(with_seed([Path(row.partition(AT)[2])], seed))
+        for row in chosen
+        for seed in range(arguments.seeds)
+        if AT in row
+    }
+
+    def make(row: str, seed: int) -> WithSampler:
+        request = Request(
+            row.partition(AT)[0],
+            named.get((row, seed), checkpoints[seed]),
+            device=device,
+            settings=FineTuning(trainable=arguments.fine_tune, seed=seed),
+            objects=_supports(data[seed], names),
+            preset=arguments.preset,
+            protocol=arguments.protocol,
+        )
+        return WithSampler(make_method(request), PROTOCOLS[arguments.protocol])
+
+    first = {name: make(name, 0) for name in chosen}  # a wrong name is found before the first object is adapted to
+    check_fine_tune(arguments.fine_tune, sum(isinstance(made.adapter, FineTuned) for made in first.values()))
+    return {name: lambda seed, name=name: make(name, seed) if seed else first[name] for name in chosen}
+
+
+def _show(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Comparison], console: Console) -> None:
+    """Print the tables of methods and of their pairs, and what was compared."""
+    from hyperplanes.evaluation.tables import PAIR_HEADINGS, compared_rows, headings, rows
+
+    count = len(scores[0].objects)
+    console.table(headings(scores), rows(scores))
+    if count > 1 and pairs:
+        console.table(PAIR_HEADINGS, compared_rows(pairs[:LARGEST_TABLE]))
+        if (more := len(pairs) - LARGEST_TABLE) > 0:
+            console.say(f"{counted(more, 'more pair')} with smaller differences: --markdown FILE writes all of them")
+    console.say(f"{counted(count, 'object')} of {arguments.data}{_of_seeds(arguments)}")
+    if line := _of_shown(scores):
+        console.warn(line)
 
 
 def _tasks(arguments: Arguments, opened: Dataset, seed: int) -> Tasks:

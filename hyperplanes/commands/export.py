@@ -12,6 +12,7 @@ Example:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -23,6 +24,7 @@ from hyperplanes.commands.output.writing import writes_to
 
 if TYPE_CHECKING:
     from hyperplanes.adaptation.base import AdaptedField
+    from hyperplanes.export.baking import BakedScene
     from hyperplanes.fields.baked import BakedField
     from hyperplanes.views import Views
 
@@ -96,29 +98,11 @@ def run(arguments: Arguments) -> int:
     """Adapt to the views and write the requested outputs."""
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.data.devices import choose_device
-    from hyperplanes.export.animation import choose_representation
-    from hyperplanes.export.baking import BakedScene, coarsening, default_side
-    from hyperplanes.export.images import encode_animation, orbit_cameras, require_encoder, save_images, to_pixels
+    from hyperplanes.export.baking import BakedScene, default_side
+    from hyperplanes.export.images import save_images
     from hyperplanes.export.page import page_of, save_page, turning_picture
-    from hyperplanes.export.surfaces.mesh import check_voxels
-    from hyperplanes.utilities.files.writing import write_whole
-    from hyperplanes.utilities.messages.errors import rename_errors
-    from hyperplanes.utilities.messages.formatting import counted
 
-    if not arguments.what:
-        raise ValueError("--what: expected at least one of images, turntable, mesh, page, splats, points, got none")
-    _refuse_unused(arguments)
-    if "turntable" in arguments.what:
-        check_orbit(arguments.frames, arguments.size)
-        require_encoder(arguments.turntable)
-    if arguments.level is not None and not arguments.level > 0:
-        raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")
-    if "mesh" in arguments.what:
-        with rename_errors("voxels", "--voxels"):
-            check_voxels(arguments.voxels)
-    if arguments.page_voxels is not None:
-        with rename_errors("side", "--page-voxels"):
-            coarsening(arguments.page_voxels)
+    _check(arguments)
     console, device, out = Console(), choose_device(arguments.device), arguments.out
     source = load_source(arguments.checkpoint, device, reflections=not arguments.no_reflections)
     given = {
@@ -146,30 +130,15 @@ def run(arguments: Arguments) -> int:
         paths = save_images(render_views(field, query.cameras, console).images, out / "images", query.names)
         console.say(f"{out / 'images'}: {len(paths)} pictures of the {_compared_with(arguments)} poses")
     if "turntable" in arguments.what:
-        path = out / f"turntable.{arguments.turntable}"
-        cameras = orbit_cameras(shown, arguments.frames, size=arguments.size)
-        # without fitting, voxels show less detail than the field
-        drawing = choose_representation(field, shown, cameras, "auto" if arguments.fit else "field", make=voxels)
-        pictures = render_views(drawing, cameras, console)
-        write_whole(path, encode_animation(to_pixels(pictures.images), arguments.turntable))
-        console.say(f"{path}: {arguments.frames} frames")
+        _write_turntable(field, shown, arguments, console, make=voxels)
     if "mesh" in arguments.what:
         solid = field if isinstance(field, AdaptedField) else field.adapted
         _write_mesh(solid, shown, query, arguments, console, adaptable=not isinstance(source, BakedScene))
     if "points" in arguments.what:
-        from hyperplanes.export.surfaces.points import point_cloud, save_points
-
-        bounds = (field if isinstance(field, AdaptedField) else field.adapted).occupancy.bounds
-        plain = field.without_residuals() if isinstance(field, AdaptedField) else field
-        pictures = render_views(plain, shown.cameras, console)
-        with rename_errors("count", "--points"):
-            cloud = point_cloud(pictures, shown.cameras, bounds, arguments.points)
-        path = save_points(cloud, out / "points.ply")
-        console.say(f"{path}: {len(cloud):,} points with normals and colours, of {counted(len(shown), 'view')}")
+        _write_points(field, shown, arguments, console)
     if {"page", "splats"} & set(arguments.what):
         if isinstance(field, AdaptedField):
-            side = arguments.page_voxels or default_side(shown.size)
-            baked = voxels(field, shown, side)
+            baked = voxels(field, shown, arguments.page_voxels or default_side(shown.size))
         else:
             baked = field.field
         if "page" in arguments.what:
@@ -179,6 +148,29 @@ def run(arguments: Arguments) -> int:
         if "splats" in arguments.what:
             _write_splats(baked, shown, query, arguments, console)
     return 0
+
+
+def _check(arguments: Arguments) -> None:
+    """Refuse wrong options before anything is read."""
+    from hyperplanes.export.baking import coarsening
+    from hyperplanes.export.images import require_encoder
+    from hyperplanes.export.surfaces.mesh import check_voxels
+    from hyperplanes.utilities.messages.errors import rename_errors
+
+    if not arguments.what:
+        raise ValueError("--what: expected at least one of images, turntable, mesh, page, splats, points, got none")
+    _refuse_unused(arguments)
+    if "turntable" in arguments.what:
+        check_orbit(arguments.frames, arguments.size)
+        require_encoder(arguments.turntable)
+    if arguments.level is not None and not arguments.level > 0:
+        raise ValueError(f"--level: expected a density above 0, got {arguments.level:g}")
+    if "mesh" in arguments.what:
+        with rename_errors("voxels", "--voxels"):
+            check_voxels(arguments.voxels)
+    if arguments.page_voxels is not None:
+        with rename_errors("side", "--page-voxels"):
+            coarsening(arguments.page_voxels)
 
 
 def _refuse_unused(arguments: Arguments) -> None:
@@ -195,6 +187,44 @@ def _refuse_unused(arguments: Arguments) -> None:
 def _compared_with(arguments: Arguments) -> str:
     """The kind of views that the outputs are compared with: "support" with `--all-views`, otherwise "query"."""
     return "support" if arguments.all_views else "query"
+
+
+def _write_turntable(
+    field: AdaptedField | BakedScene,
+    shown: Views,
+    arguments: Arguments,
+    console: Console,
+    *,
+    make: Callable[[AdaptedField, Views, int], BakedField],
+) -> None:
+    """Write an animation of an orbit, of the field or of the voxels that `make` makes of it."""
+    from hyperplanes.export.animation import choose_representation
+    from hyperplanes.export.images import encode_animation, orbit_cameras, to_pixels
+    from hyperplanes.utilities.files.writing import write_whole
+
+    path = arguments.out / f"turntable.{arguments.turntable}"
+    cameras = orbit_cameras(shown, arguments.frames, size=arguments.size)
+    # without fitting, voxels show less detail than the field
+    drawing = choose_representation(field, shown, cameras, "auto" if arguments.fit else "field", make=make)
+    pictures = render_views(drawing, cameras, console)
+    write_whole(path, encode_animation(to_pixels(pictures.images), arguments.turntable))
+    console.say(f"{path}: {arguments.frames} frames")
+
+
+def _write_points(field: AdaptedField | BakedScene, shown: Views, arguments: Arguments, console: Console) -> None:
+    """Write the points that the support views show."""
+    from hyperplanes.adaptation.base import AdaptedField
+    from hyperplanes.export.surfaces.points import point_cloud, save_points
+    from hyperplanes.utilities.messages.errors import rename_errors
+    from hyperplanes.utilities.messages.formatting import counted
+
+    bounds = (field if isinstance(field, AdaptedField) else field.adapted).occupancy.bounds
+    plain = field.without_residuals() if isinstance(field, AdaptedField) else field
+    pictures = render_views(plain, shown.cameras, console)
+    with rename_errors("count", "--points"):
+        cloud = point_cloud(pictures, shown.cameras, bounds, arguments.points)
+    path = save_points(cloud, arguments.out / "points.ply")
+    console.say(f"{path}: {len(cloud):,} points with normals and colours, of {counted(len(shown), 'view')}")
 
 
 def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:

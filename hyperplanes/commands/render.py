@@ -42,6 +42,8 @@ from hyperplanes.utilities.messages.formatting import counted, format_duration
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
+    from hyperplanes.adaptation.base import Renderable
+    from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.export.animation import Representation
     from hyperplanes.rendering.images import Pictures
     from hyperplanes.views import Views
@@ -107,17 +109,14 @@ class Asked:
 @writes_to(lambda arguments: arguments.out, check=lambda arguments: refuse_sources(arguments.out, arguments.views))
 def run(arguments: Arguments) -> int:
     """Adapt, render, write the pictures, and print their PSNR if the true images are known."""
-    from hyperplanes.adaptation.correction.residuals import CorrectedField, ResidualField
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.configuration.fine_tuning import FineTuning
     from hyperplanes.configuration.presets import PROTOCOLS
     from hyperplanes.data.devices import choose_device
-    from hyperplanes.evaluation.suitability import held_out_psnr, worse_than_copying
-    from hyperplanes.export.animation import choose_representation
+    from hyperplanes.evaluation.suitability import worse_than_copying
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.images import encode_animation
     from hyperplanes.export.outputs import output_frames, save_outputs
-    from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
     from hyperplanes.utilities.files.writing import write_whole
     from hyperplanes.utilities.messages.errors import listed
 
@@ -143,15 +142,7 @@ def run(arguments: Arguments) -> int:
     if isinstance(source, HyperPlanes) and (arguments.residuals == "off" or arguments.protocol != "default"):
         source = source.without_residuals()
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
-    make = partial(bake_field, fit=VOXEL_STEPS, console=console)
-    field = choose_representation(field, shown, asked.cameras, _representation(arguments, asked), make=make)
-    if arguments.residuals == "on" and not isinstance(field, CorrectedField):
-        field = ResidualField(field, shown)
-    residuals = field.residuals if isinstance(field, CorrectedField) else field
-    corrected = isinstance(residuals, ResidualField)
-    if corrected:
-        with console.bar("residuals") as bar:
-            residuals.prepare(lambda done: bar.show(done, len(shown), "support views"))
+    field, corrected = _drawn(arguments, field, shown, asked, console)
     started = time.perf_counter()
     pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / asked.cameras.batch_size
@@ -169,14 +160,7 @@ def run(arguments: Arguments) -> int:
             write_whole(path, encode_animation(frames, arguments.turntable, lasting))
             console.say(f"{path}: an animation of {lasting:.3g} seconds")
     if scores is None and not isinstance(source, BakedScene) and (arguments.steps == 0 or warned):
-        scores = held_out_psnr(source, shown)
-        if scores is not None:
-            without = " and residuals" if corrected else ""
-            console.say(
-                f"without fine-tuning{without}, on held-out support views: {scores[0]:.2f} dB PSNR; "
-                f"copying the nearest view has {scores[1]:.2f} dB"
-            )
-            scores = scores if arguments.steps == 0 else None
+        scores = _held_out(arguments, source, shown, corrected, console)
     steps = None if isinstance(source, BakedScene) else arguments.steps
     for line in worse_than_copying(shown, *scores, steps) if scores else []:
         console.warn(f"{task.name}: {line}")
@@ -185,6 +169,26 @@ def run(arguments: Arguments) -> int:
     how = " (colours corrected by residuals)" if corrected else ""
     console.say(f"{arguments.out}: {counted(len(paths), 'picture')}{how}, {format_duration(seconds)} a view")
     return 0
+
+
+def _drawn(
+    arguments: Arguments, field: Renderable, shown: Views, asked: Asked, console: Console
+) -> tuple[Renderable, bool]:
+    """The field, or its voxels, with residuals if requested, and whether there are residuals."""
+    from hyperplanes.adaptation.correction.residuals import CorrectedField, ResidualField
+    from hyperplanes.export.animation import choose_representation
+    from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
+
+    make = partial(bake_field, fit=VOXEL_STEPS, console=console)
+    field = choose_representation(field, shown, asked.cameras, _representation(arguments, asked), make=make)
+    if arguments.residuals == "on" and not isinstance(field, CorrectedField):
+        field = ResidualField(field, shown)
+    residuals = field.residuals if isinstance(field, CorrectedField) else field
+    if not isinstance(residuals, ResidualField):
+        return field, False
+    with console.bar("residuals") as bar:
+        residuals.prepare(lambda done: bar.show(done, len(shown), "support views"))
+    return field, True
 
 
 def _representation(arguments: Arguments, asked: Asked) -> Representation:
@@ -239,6 +243,22 @@ def _asked(arguments: Arguments, shown: Views, known: Views, up: str, console: C
         size = arguments.size or min(max(shown.size), LARGEST_ORBIT)
         return Asked(orbit_cameras(shown, arguments.orbit, size=size), animation=("turntable", ROUND))
     return Asked(known.cameras, known.names)
+
+
+def _held_out(
+    arguments: Arguments, source: HyperPlanes, shown: Views, corrected: bool, console: Console
+) -> tuple[float, float] | None:
+    """Print what `held_out_psnr` returns, and return it if the field has no gradient steps, as in that comparison."""
+    from hyperplanes.evaluation.suitability import held_out_psnr
+
+    scores = held_out_psnr(source, shown)
+    if scores is not None:
+        without = " and residuals" if corrected else ""
+        console.say(
+            f"without fine-tuning{without}, on held-out support views: {scores[0]:.2f} dB PSNR; "
+            f"copying the nearest view has {scores[1]:.2f} dB"
+        )
+    return scores if arguments.steps == 0 else None
 
 
 def _compared(

@@ -32,6 +32,7 @@ from hyperplanes.utilities.messages.shell import command_line
 
 if TYPE_CHECKING:
     from hyperplanes.evaluation import ObjectScore
+    from hyperplanes.experiments.engine import Outcome, Runner
     from hyperplanes.experiments.paper.experiment import Cell
 
 __all__ = ["Arguments", "data_sets", "run"]
@@ -102,11 +103,8 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.experiments import SCALES, find_experiment, report
     from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
     from hyperplanes.experiments.estimate import estimate
-    from hyperplanes.experiments.figures import curves_of, figure_of, pictures_of
     from hyperplanes.experiments.paper.tables import CLASSES
     from hyperplanes.experiments.workspace import Workspace
-    from hyperplanes.utilities.files.writing import write_json, write_whole
-    from hyperplanes.utilities.images.plots import save_figure
     from hyperplanes.utilities.messages.formatting import format_duration
 
     console = Console()
@@ -144,14 +142,7 @@ def run(arguments: Arguments) -> int:
     with workers or nullcontext():
         outcome = runner.run(experiment, seeds, found)
     folder = arguments.out / experiment.name
-    command = _command(arguments, seeds)
-    write_json(folder / "results.json", report.as_json(outcome, command))
-    write_whole(folder / "table.csv", report.as_csv(outcome).encode())
-    made = {"figure": figure_of(outcome), "curves": curves_of(outcome), "pictures": pictures_of(runner, outcome)}
-    names = {f"{name}.png": figure for name, figure in made.items() if figure is not None}
-    for name, figure in names.items():
-        save_figure(figure, folder / name)
-    write_whole(folder / "table.md", report.as_markdown(outcome, command, [*names]).encode())
+    names = _write(folder, _command(arguments, seeds), outcome, runner)
     console.say(f"{experiment.title}; HyperPlanes (arXiv 2402.01524), {experiment.where}")
     console.table(report.headings(outcome), report.rows(outcome))
     for line in report.what_differs(outcome):
@@ -160,8 +151,25 @@ def run(arguments: Arguments) -> int:
         console.table(DIFFERENCE_HEADINGS, settings)
         for line in report.sources():
             console.say(f"- {line}")
-    console.say(f"{folder}: {', '.join(['table.md', 'table.csv', 'results.json', *names])}")
+    console.say(f"{folder}: {', '.join(names)}")
     return 0
+
+
+def _write(folder: Path, command: str, outcome: Outcome, runner: Runner) -> list[str]:
+    """Write the table and its figures; returns the names of the files."""
+    from hyperplanes.experiments import report
+    from hyperplanes.experiments.figures import curves_of, figure_of, pictures_of
+    from hyperplanes.utilities.files.writing import write_json, write_whole
+    from hyperplanes.utilities.images.plots import save_figure
+
+    write_json(folder / "results.json", report.as_json(outcome, command))
+    write_whole(folder / "table.csv", report.as_csv(outcome).encode())
+    made = {"figure": figure_of(outcome), "curves": curves_of(outcome), "pictures": pictures_of(runner, outcome)}
+    names = {f"{name}.png": figure for name, figure in made.items() if figure is not None}
+    for name, figure in names.items():
+        save_figure(figure, folder / name)
+    write_whole(folder / "table.md", report.as_markdown(outcome, command, [*names]).encode())
+    return ["table.md", "table.csv", "results.json", *names]
 
 
 def _command(arguments: Arguments, seeds: int) -> str:

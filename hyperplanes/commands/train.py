@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from hyperplanes.configuration.presets import Preset
     from hyperplanes.training import Progress, Trainer
     from hyperplanes.training.monitoring import TensorBoard
+    from hyperplanes.views import Tasks
 
 __all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 
@@ -310,12 +311,30 @@ def run(arguments: Arguments) -> int:
         return 0  # the process that ended first has printed the reason
 
 
+def _opened(arguments: Arguments, chosen: Preset, console: Console) -> Tasks:
+    """The objects to train on and those held out, with the requested number of support views."""
+    from hyperplanes.data.dataset import open_datasets
+    from hyperplanes.data.support import WithSupport
+
+    data = open_datasets(arguments.data, chosen.training.memory, legacy=arguments.legacy)
+    for line in data.skipped:
+        console.warn(line)
+    if not data.names("train"):
+        raise ValueError(
+            f"{' '.join(map(str, arguments.data))}: expected objects to train on, found none in its train split; "
+            "a single scene can only be rendered or evaluated"
+        )
+    if arguments.support is not None and chosen.training.views:
+        raise ValueError(
+            "--support: expected none, because training.views sets the number of support views; use --training.views"
+        )
+    return data if arguments.support is None else WithSupport(data, arguments.support)
+
+
 def _run(arguments: Arguments) -> int:
     from hyperplanes.adaptation.checkpoints import find_checkpoints
     from hyperplanes.configuration.settings_file import write_experiment
-    from hyperplanes.data.dataset import open_datasets
     from hyperplanes.data.devices import choose_device
-    from hyperplanes.data.support import WithSupport
     from hyperplanes.training import start_training
     from hyperplanes.training.episodes.loader import reference_objects
     from hyperplanes.training.monitoring import TensorBoard
@@ -328,20 +347,7 @@ def _run(arguments: Arguments) -> int:
     console = Console(silent=not first)
     chosen = resolve(arguments)
     method = chosen.model.method
-    data = open_datasets(arguments.data, chosen.training.memory, legacy=arguments.legacy)
-    shown = " ".join(map(str, arguments.data))
-    for line in data.skipped:
-        console.warn(line)
-    if not data.names("train"):
-        raise ValueError(
-            f"{shown}: expected objects to train on, found none in its train split; "
-            "a single scene can only be rendered or evaluated"
-        )
-    if arguments.support is not None and chosen.training.views:
-        raise ValueError(
-            "--support: expected none, because training.views sets the number of support views; use --training.views"
-        )
-    tasks = data if arguments.support is None else WithSupport(data, arguments.support)
+    tasks = _opened(arguments, chosen, console)
     reference = None
     if arguments.checkpoint is not None:
         reference = arguments.checkpoint
@@ -350,7 +356,7 @@ def _run(arguments: Arguments) -> int:
     processes = count_processes(arguments.devices, arguments.nodes)
     objects = reference_objects(chosen.model, chosen.training)
     check_shares(chosen.training.tasks, objects, processes[0] * processes[1])
-    held_out = len(data.names("test"))
+    held_out = len(tasks.names("test"))
     with launched(*processes, choose_device(arguments.device)) as device:
         trainer = start_training(chosen.model, chosen.training, tasks, arguments.out, device, reference)
         begun = trainer.step

@@ -27,6 +27,7 @@ from hyperplanes.utilities.files.encoding import encode_png
 from hyperplanes.utilities.files.reading import format_of
 from hyperplanes.utilities.files.writing import write_whole
 from hyperplanes.utilities.images.image_range import check_image_range
+from hyperplanes.utilities.images.sizes import scaled_size
 from hyperplanes.utilities.messages.arguments import checked
 from hyperplanes.utilities.messages.errors import MissingPackageError
 from hyperplanes.views import Views
@@ -247,9 +248,7 @@ def orbit_cameras(
     batch = camera.with_poses(camera.select(lens, [0] * count), _stepped_back(pose, lens, views))
     if size is None:
         return batch
-    height, width = views.size
-    scale = size / max(height, width)
-    return camera.resized(batch, max(1, round(height * scale)), max(1, round(width * scale)))
+    return camera.resized(batch, *scaled_size(views.size, size, enlarge=True))
 
 
 def _stepped_back(pose: Tensor, lens: PinholeCamera, views: Views) -> Tensor:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.fields.baked import HARMONICS, BakedField, spherical_harmonics
+from hyperplanes.fields.baked import FIRST_HARMONIC, HARMONICS, BakedField, spherical_harmonics
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.occupancy import Occupancy
@@ -38,7 +38,6 @@ RATES = {"means": 0.3, "scales": 0.06, "quaternions": 0.06, "logits": 0.4, "coef
 DIRECTIONAL = 0.2  # learning rate of view-dependent coefficients, relative to that of the mean colour
 SEEN = 0.1  # largest contribution to a picture, in pixels, below which a splat counts as hidden and is left out
 AROUND = 16  # cameras from all sides, beside the views, that decide which splats are hidden
-MEAN = 0.28209479  # the first harmonic
 HALF_TURN = (1, -1, -1, 1, -1, 1, 1, -1, 1)  # signs of the harmonics under (x, y, z) -> (x, -y, -z)
 
 
@@ -220,7 +219,7 @@ def _ply(splats: Splats) -> bytes:
     columns = {
         "x y z": splats.means,
         "nx ny nz": torch.zeros(number, 3),
-        "f_dc_0 f_dc_1 f_dc_2": coefficients[..., 0] - 0.5 / MEAN,
+        "f_dc_0 f_dc_1 f_dc_2": coefficients[..., 0] - 0.5 / FIRST_HARMONIC,
         " ".join(f"f_rest_{place}" for place in range(45)): rest,
         "opacity": splats.logits[:, None],
         "scale_0 scale_1 scale_2": splats.scales.log(),
@@ -235,7 +234,7 @@ def _splat(splats: Splats) -> bytes:
     """32 bytes a splat: position, scales, colour with opacity, and rotation; the most visible ones first."""
     kind = np.dtype([("mean", "<f4", 3), ("size", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
     opacity = splats.logits.sigmoid()
-    colour = splats.coefficients.reshape(-1, 3, HARMONICS)[..., 0] * MEAN
+    colour = splats.coefficients.reshape(-1, 3, HARMONICS)[..., 0] * FIRST_HARMONIC
     content = np.zeros(len(splats.means), kind)
     content["mean"] = splats.means.numpy()
     content["size"] = splats.scales.numpy()

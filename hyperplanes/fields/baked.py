@@ -14,9 +14,10 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files.checkpoints import CheckpointError, load_tensors, save_tensors
 
-__all__ = ["HARMONICS", "LARGEST_SIDE", "BakedField", "spherical_harmonics"]
+__all__ = ["FIRST_HARMONIC", "HARMONICS", "LARGEST_SIDE", "BakedField", "spherical_harmonics"]
 
 HARMONICS = 9
+FIRST_HARMONIC = 0.28209479  # of degree 0
 LARGEST_SIDE = 512
 STORED = {  # dtypes of the tensors in a file
     "occupied": torch.uint8,
@@ -36,7 +37,7 @@ def spherical_harmonics(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, 
     x, y, z = directions.unbind(-1)
     return torch.stack(
         [
-            torch.full_like(x, 0.28209479),
+            torch.full_like(x, FIRST_HARMONIC),
             -0.48860251 * y,
             0.48860251 * z,
             -0.48860251 * x,

@@ -84,6 +84,13 @@ def test_the_calibration_of_a_frame_takes_precedence(scene, tmp_path):
     assert focal.tolist() == [100.0, 50.0, 100.0]
 
 
+def test_skew_is_refused_as_the_file_cannot_store_it():
+    lenses = np.diag([2.0, 2.0, 1.0])[None].repeat(2, 0)
+    lenses[1, 0, 1] = -0.25
+    with pytest.raises(ValueError, match=r"^intrinsics: expected no skew, got -0.25$"):
+        transforms_document(np.eye(4)[None].repeat(2, 0), lenses, (1, 1), ["0.png", "1.png"])
+
+
 def test_written_files_are_read_back(scene, tmp_path):
     document = transforms_document(
         np.linalg.inv(scene.camera_from_world),

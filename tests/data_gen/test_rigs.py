@@ -161,6 +161,7 @@ def test_one_intrinsic_matrix_serves_all_views():
         (lambda: rigs.fixed(4, 16, field_of_view=180.0), "got 180.0"),
         (lambda: Rig(np.eye(4), np.eye(3), 4, 4, 1, 2), r"got \(4, 4\)"),
         (lambda: Rig(np.eye(4)[None], np.eye(4), 4, 4, 1, 2), r"got \(4, 4\)"),
+        (lambda: Rig(np.eye(4)[None], np.eye(3) + 0.5 * np.eye(3, k=1), 4, 4, 1, 2), "expected no skew, got 0.5$"),
         (lambda: Rig(2 * np.eye(4)[None], np.eye(3), 4, 4, 1, 2), "without scale or mirroring"),
         (lambda: Rig(np.diag([1.0, 1, -1, 1])[None], np.eye(3), 4, 4, 1, 2), "determinants from -1"),
         (lambda: Rig(np.eye(4)[None] * np.nan, np.eye(3), 4, 4, 1, 2), "NaN"),

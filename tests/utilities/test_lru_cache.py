@@ -32,5 +32,9 @@ def test_a_value_above_the_budget_stays_only_with_keep_last():
         cache = LRUCache(30, keep_last=keep_last)
         cache.add("a", Sized(10))
         cache.add("large", Sized(40))
-        expected = (None, Sized(40), 40) if keep_last else (None, None, 0)
+        expected = (None, Sized(40), 40) if keep_last else (Sized(10), None, 10)
         assert (cache.get("a"), cache.get("large"), cache.nbytes) == expected
+    cache = LRUCache(30)
+    cache.add("a", Sized(10))
+    cache.add("a", Sized(40))
+    assert (cache.get("a"), cache.nbytes) == (None, 0)  # what was replaced is not returned either

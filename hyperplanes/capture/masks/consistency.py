@@ -21,6 +21,7 @@ from hyperplanes.data.pictures.bounds import smallest_ball
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Sphere
+from hyperplanes.utilities.images.sizes import scaled_size
 
 __all__ = ["Agreement", "agree"]
 
@@ -126,10 +127,8 @@ def agree(
 
 def _reduced(mask: Mask) -> Bool[np.ndarray, "row column"]:
     """A mask reduced to at most LONGEST pixels along its longer side."""
-    height, width = mask.shape
-    factor = min(1.0, LONGEST / max(height, width))
-    size = max(1, round(width * factor)), max(1, round(height * factor))
-    return np.asarray(Image.fromarray(mask.astype(np.float32)).resize(size, Image.Resampling.BOX)) > 0.4
+    picture = Image.fromarray(mask.astype(np.float32))
+    return np.asarray(picture.resize(scaled_size(picture.size, LONGEST), Image.Resampling.BOX)) > 0.4
 
 
 def _camera(model: SparseModel, row: int, mask: Mask, size: tuple[int, ...]) -> PinholeCamera:

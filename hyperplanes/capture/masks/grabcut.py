@@ -14,6 +14,7 @@ from hyperplanes.capture.masks.regions import cleaned, firm
 from hyperplanes.capture.packages import require
 from hyperplanes.capture.placement import object_points, object_sphere
 from hyperplanes.capture.sparse_model import SparseModel
+from hyperplanes.utilities.images.sizes import scaled_size
 
 __all__ = ["GrabCut", "extended"]
 
@@ -38,8 +39,8 @@ class GrabCut:
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"], camera: int) -> Float[np.ndarray, "height width"]:
         """Opacity in [0, 1]."""
-        size, scale = _reduced_size(picture)
-        labels = self._seeds(camera, size, scale)
+        size = scaled_size(picture.shape[1::-1], LONGEST)
+        labels = self._seeds(camera, size, max(size) / max(picture.shape[:2]))
         if not (labels == self._cv2.GC_FGD).any():
             return np.zeros(picture.shape[:2])
         return cleaned(_cut(picture, labels))
@@ -82,7 +83,7 @@ def extended(
         Opacity in [0, 1].
     """
     cv2 = require("cv2", "completes masks by colour")
-    size, _ = _reduced_size(picture)
+    size = scaled_size(picture.shape[1::-1], LONGEST)
     likely, allowed = (np.asarray(_resized(values, size) > 0.5) for values in (mask, possible))
     depth = max(1, round(CERTAIN * float(np.sqrt(likely.sum()))))
     certain = np.asarray(ndimage.binary_erosion(likely, iterations=depth), bool)
@@ -103,13 +104,6 @@ def _cut(picture: np.ndarray, labels: np.ndarray, steps: int = STEPS) -> np.ndar
     labels, _, _ = cv2.grabCut(small, labels, None, *models, steps, cv2.GC_INIT_WITH_MASK)
     height, width = picture.shape[:2]
     return firm(_resized(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), (width, height)))
-
-
-def _reduced_size(picture: np.ndarray) -> tuple[tuple[int, int], float]:
-    """(width, height) of the image that is segmented, and its scale relative to the given image."""
-    height, width = picture.shape[:2]
-    scale = min(1.0, LONGEST / max(height, width))
-    return (max(1, round(width * scale)), max(1, round(height * scale))), scale
 
 
 def _resized(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -130,6 +130,7 @@ def read_path(
     from hyperplanes.data.upright import upright_cameras
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.utilities.files.reading import read_json
+    from hyperplanes.utilities.images.sizes import scaled_size
 
     listed = locate_scene(scene)
     listed = listed if listed.is_file() else listed / "transforms.json"
@@ -144,8 +145,7 @@ def read_path(
         console.warn(f"{path}: {note}")
     height, width = camera.image_size(cameras)
     if size is not None:
-        scale = size / max(height, width)
-        cameras = camera.resized(cameras, max(1, round(height * scale)), max(1, round(width * scale)))
+        cameras = camera.resized(cameras, *scaled_size((height, width), size, enlarge=True))
     elif max(height, width) > LARGEST_UNASKED:
         console.say(
             f"{path}: pictures of {width}x{height}, the size in this file; smaller ones (--size) take less time"

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, max_pool2d, normalize
 
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.utilities.images.sizes import scaled_size
 from hyperplanes.views import Views
 
 __all__ = ["Matches", "match_pictures", "sampson"]
@@ -77,9 +78,7 @@ def match_pictures(views: Views, across: Bool[Tensor, " view"] | None = None) ->
     pairs = {(min(a, b), max(a, b)) for a, b in enumerate(nearest) if alike[a, b] > least}
     chosen = sorted(pairs, key=lambda pair: -float(alike[pair]))
     chosen = chosen[:: max(1, len(chosen) // PAIRS)][:PAIRS]
-    height, width = views.size
-    scale = min(1.0, LARGEST / max(height, width))
-    size = max(1, round(height * scale)), max(1, round(width * scale))
+    size = scaled_size(views.size, LARGEST)
     cameras = camera.resized(views.cameras, *size)
     corners = {view: _corners(views.images[view], size) for view in sorted({view for pair in chosen for view in pair})}
     found = [_matched(corners[a], corners[b]) for a, b in chosen]

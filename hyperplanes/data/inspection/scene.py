@@ -23,6 +23,7 @@ from hyperplanes.data.upright import guess_up, upright
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.poses import fibonacci_sphere
+from hyperplanes.utilities.images.sizes import scaled_size
 from hyperplanes.views import Views
 
 __all__ = ["NEAR", "WORST", "SceneReport", "ViewReport", "angles_to", "describe_scene", "stand_upright"]
@@ -309,8 +310,7 @@ def _sharpness(views: Views, apart: Tensor) -> Float[Tensor, " view"]:
     Of small grey pictures, the mean absolute Laplacian over the mean absolute gradient, within the mask: blur takes
     from the one more than from the other, distance and contrast hardly matter.
     """
-    scale = min(1.0, SHARP / max(views.size))
-    size = max(3, round(views.size[0] * scale)), max(3, round(views.size[1] * scale))
+    size = [max(3, side) for side in scaled_size(views.size, SHARP)]
     grey = interpolate(views.images.mean(1, keepdim=True), size, mode="area")
     inside = torch.ones_like(grey) if views.masks is None else interpolate(views.masks, size, mode="area")
     inside = 1 - torch.nn.functional.max_pool2d(1 - inside, 3, 1, 1)[:, :, 1:-1, 1:-1]  # away from the outline

@@ -24,7 +24,6 @@ from hyperplanes.views import Task, Views
 
 __all__ = ["Posed", "PosedTask", "check_pose", "posed"]
 
-ROTATION_TOLERANCE = 1e-3
 FARTHEST = 1e3  # extents of a scene: its largest distance from the origin at which float32 is exact to 0.1 pixels
 
 
@@ -261,7 +260,7 @@ def check_pose(matrix: object, source: str | Path, frame: str) -> npt.NDArray[np
     rotation = pose[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))
-    if error > ROTATION_TOLERANCE or determinant < 0 or np.abs(pose[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
+    if max(np.abs(pose[3] - [0, 0, 0, 1]).max(), error) > camera.ROTATION_TOLERANCE or determinant < 0:
         found = f"|R R^T - I| = {error:.2g}, determinant {determinant:.3g}, last row {pose[3].tolist()}"
         raise DataError(where, "a rotation and a translation", found, "take scale and mirroring out of the poses")
     return pose

@@ -17,6 +17,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.surfaces.mesh import Surface, as_trimesh, distances_to
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
+from hyperplanes.utilities.images.sizes import scaled_size
 
 __all__ = ["Agreement", "agreement", "choose_level"]
 
@@ -101,9 +102,7 @@ def _small_cameras(cameras: PinholeCamera, most: int) -> PinholeCamera:
     """Some of the cameras, spread over all, at SILHOUETTE pixels along the longer side, on the CPU."""
     chosen = torch.linspace(0, cameras.batch_size - 1, min(most, cameras.batch_size)).round().long()
     cameras = camera.to(camera.select(cameras, chosen.to(cameras.extrinsics.device)), "cpu", torch.float32)
-    height, width = camera.image_size(cameras)
-    scale = SILHOUETTE / max(height, width)
-    return camera.resized(cameras, max(1, round(height * scale)), max(1, round(width * scale)))
+    return camera.resized(cameras, *scaled_size(camera.image_size(cameras), SILHOUETTE, enlarge=True))
 
 
 def _pixel_rays(cameras: PinholeCamera) -> list[Rays]:

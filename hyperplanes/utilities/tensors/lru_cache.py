@@ -41,6 +41,8 @@ class LRUCache(Generic[Value]):
         """Store a value."""
         if name in self._values:
             self.nbytes -= self._values.pop(name).nbytes
+        if value.nbytes > self.budget and not self.keep_last:
+            return
         self._values[name] = value
         self.nbytes += value.nbytes
         while self.nbytes > self.budget and len(self._values) > int(self.keep_last):

@@ -47,10 +47,15 @@ def transforms_document(
     Returns:
         A dictionary that can be written as JSON.
 
+    Raises:
+        ValueError: a camera with skew, for which the file has no field.
+
     >>> document = transforms_document(np.eye(4)[None], np.diag([2.0, 2.0, 1.0])[None], (1, 1), ["0.png"])
     >>> document["cx"], document["frames"][0]["transform_matrix"][2]
     (0.5, [0.0, 0.0, -1.0, 0.0])
     """
+    if (skew := intrinsics[:, 0, 1]).any():
+        raise ValueError(f"intrinsics: expected no skew, got {skew[skew != 0][0]:g}")
     poses = flip_camera_axes(world_from_camera) + 0.0
     shared = bool((intrinsics == intrinsics[:1]).all())
     frames = []
