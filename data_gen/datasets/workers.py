@@ -33,7 +33,7 @@ __all__ = [
     "worker_environment",
 ]
 
-ATTEMPTS = 2
+MAX_ATTEMPTS = 2
 """How often an item is tried if its worker crashes."""
 
 START_SECONDS = 120.0
@@ -164,7 +164,7 @@ def run_workers(
                 if item is None:
                     break
                 answer: dict[str, Any] = {}
-                for attempt in range(1, ATTEMPTS + 1):
+                for attempt in range(1, MAX_ATTEMPTS + 1):
                     if worker is None:
                         worker, left = open_worker(), recycle
                     try:
