@@ -18,7 +18,7 @@ from hyperplanes.utilities.files.reading import DataError
 
 __all__ = ["Command"]
 
-LONGEST = 600  # seconds: time limit for one image
+TIMEOUT_SECONDS = 600  # seconds: time limit for one image
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Command:
                 word.replace("{image}", str(image)).replace("{mask}", str(mask)) for word in shlex.split(self.line)
             ]
             try:
-                done = subprocess.run(words, capture_output=True, text=True, timeout=LONGEST, check=False)
+                done = subprocess.run(words, capture_output=True, text=True, timeout=TIMEOUT_SECONDS, check=False)
             except (OSError, subprocess.TimeoutExpired) as error:
                 raise ValueError(f"--mask: expected a program that runs, found {error}; check {self.line!r}") from error
             if done.returncode or not mask.is_file():

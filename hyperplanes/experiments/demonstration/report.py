@@ -13,7 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from PIL import Image
 
 from hyperplanes.adaptation.checkpoints import find_checkpoint, packaged_folder
-from hyperplanes.adaptation.correction.held_out import FEWEST
+from hyperplanes.adaptation.correction.held_out import MIN_VIEWS
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.data.dataset import read_task
@@ -23,7 +23,7 @@ from hyperplanes.evaluation import Score
 from hyperplanes.experiments.demonstration.settings import (
     BASELINES,
     MODELS,
-    PACKAGED,
+    PACKAGED_MODEL,
     QUERY_VIEWS,
     DemoSettings,
     describe_row,
@@ -78,7 +78,7 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
     height, width = task.query.size
     page = Report(
         title=TITLE,
-        lead=f"The packaged model {PACKAGED!r} reads posed images of an object, any number of them from any "
+        lead=f"The packaged model {PACKAGED_MODEL!r} reads posed images of an object, any number of them from any "
         "viewpoints, and predicts the weights of a field, which is rendered from new viewpoints. Nothing was trained "
         "for this page.",
         figures=[
@@ -93,15 +93,16 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
         curves={},
         tuning={},
         diagnostics="",
-        facts=[("weights", f"{PACKAGED}, which comes with the package"), ("objects", ", ".join(names))],
+        facts=[("weights", f"{PACKAGED_MODEL}, which comes with the package"), ("objects", ", ".join(names))],
         commands=[
             (
                 "a turntable of your own posed images (a folder with transforms.json)",
-                f"hyperplanes render --checkpoint {PACKAGED} --views scene --out new-views --orbit 48 --all-views",
+                f"hyperplanes render --checkpoint {PACKAGED_MODEL} --views scene "
+                "--out new-views --orbit 48 --all-views",
             ),
             (
                 "the same after 100 steps on those images, which makes it sharper",
-                f"hyperplanes render --checkpoint {PACKAGED} --views scene --out sharper --steps 100 --all-views",
+                f"hyperplanes render --checkpoint {PACKAGED_MODEL} --views scene --out sharper --steps 100 --all-views",
             ),
         ],
     )
@@ -120,9 +121,9 @@ def _round(model: HyperPlanes, support: Views, cameras: PinholeCamera) -> Pixels
 def compile_kernels(device: torch.device) -> None:
     """Compile and load everything that rendering with the packaged model needs, by one small view of an example."""
     example = read_task(EXAMPLES / "example-car")
-    model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(device)
+    model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED_MODEL)).to(device)
     model.config = replace(model.config, symmetric=False)  # the search for symmetry takes time and compiles nothing
-    few = example.support[:FEWEST].resized(32)  # enough views for stacking
+    few = example.support[:MIN_VIEWS].resized(32)  # enough views for stacking
     model.adapt(few).render(resized(example.query[:1].cameras, 32, 32))
 
 
