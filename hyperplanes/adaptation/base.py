@@ -34,7 +34,7 @@ from hyperplanes.views import Views
 __all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "attributes_of", "hull"]
 
 MARGIN_LOSS = 0.9  # `margin_loss` of `refine`: 2.4 % in one voxel
-POINTS = 1 << 12  # per thread, for densities
+DENSITY_CHUNK = 1 << 12  # per thread, for densities
 
 
 @runtime_checkable
@@ -130,7 +130,7 @@ class AdaptedField:
         points = as_points(points)
         own = points.to(self.dtype)
         if self.thread_safe and points.device.type == "cpu" and not torch.is_grad_enabled():
-            return torch.cat(list(parallel_map(self._density, own.split(POINTS)))).to(points.dtype)
+            return torch.cat(list(parallel_map(self._density, own.split(DENSITY_CHUNK)))).to(points.dtype)
         return self._density(own).to(points.dtype)
 
     def _density(self, points: Tensor) -> Tensor:

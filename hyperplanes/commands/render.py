@@ -117,7 +117,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.images import encode_animation
     from hyperplanes.export.outputs import output_frames, save_outputs
-    from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
+    from hyperplanes.export.voxel_fitting import VOXEL_STEPS
     from hyperplanes.utilities.files.writing import write_whole
     from hyperplanes.utilities.messages.errors import listed
 

@@ -9,7 +9,13 @@ import torch
 
 from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig
 from hyperplanes.adaptation.alignment import canonical_frame
-from hyperplanes.adaptation.alignment.canonical_frame import FEWEST, GAIN, MOST, find_rotation, to_canonical_frame
+from hyperplanes.adaptation.alignment.canonical_frame import (
+    GAIN,
+    MAX_VIEWS,
+    MIN_VIEWS,
+    find_rotation,
+    to_canonical_frame,
+)
 from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.correction.stacking import StackedField
 from hyperplanes.adaptation.fine_tuning import NoProgressError, made_anyway
@@ -167,8 +173,8 @@ def test_objects_without_a_suitable_symmetry_or_number_of_views_are_not_rotated(
     assert found_by(monkeypatch, better, None) == 0
     assert found_by(monkeypatch, better, Symmetry(Plane((0.0, 1.0, 0.0)))) == 0
     assert found_by(monkeypatch, better, replace(ACROSS, order=3)) == 0
-    assert found_by(monkeypatch, better, count=FEWEST - 1) == 0
-    assert found_by(monkeypatch, better, count=MOST + 1) == 0
+    assert found_by(monkeypatch, better, count=MIN_VIEWS - 1) == 0
+    assert found_by(monkeypatch, better, count=MAX_VIEWS + 1) == 0
     assert found_by(monkeypatch, better, azimuth=0.0) == 0
     assert found_by(monkeypatch, better, None, azimuth=1.0) == pytest.approx(math.degrees(1.0))
 
@@ -265,7 +271,7 @@ def test_a_protocol_applies_to_a_rotated_field(angle):
 
 def test_finding_a_rotation_leaves_the_mode_and_the_weights_of_a_model(monkeypatch):
     """With two threads: the first one to end must not switch the model back to training mode for the other."""
-    monkeypatch.setattr(canonical_frame, "PIXELS", 64)
+    monkeypatch.setattr(canonical_frame, "HELD_OUT_PIXELS", 64)
     views = replace(balls(cameras(2, SMALL), BODY), masks=None)  # without a hull
     adapter, before = HyperPlanes(replace(CONFIG, symmetric=True)).train(), torch.get_num_threads()
     kept = {name: value.clone() for name, value in adapter.state_dict().items()}
