@@ -22,7 +22,7 @@ from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import Pictures
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.data import open_dataset
-from hyperplanes.data.support import Shown
+from hyperplanes.data.support import FarthestSupport
 from hyperplanes.export.baking import BakedScene, bake, default_side
 from hyperplanes.export.voxel_fitting import VOXEL_STEPS, fit_voxels, render_guide
 from hyperplanes.utilities.images.metrics import psnr
@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> int:
         data = open_dataset(path)
         names = sorted(data.names("test"))[: chosen.objects]
         for count in chosen.counts:
-            shown = Shown(data, count, chosen.query)
+            shown = FarthestSupport(data, count, chosen.query)
             found = [measure(model, shown.task(name), chosen.side, chosen.fit) for name in names]
             height, width = shown.task(names[0]).support.size
             row: Row = {"name": path.resolve().name, "views": count, "objects": len(names), "size": f"{width}x{height}"}

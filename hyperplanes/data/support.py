@@ -14,7 +14,7 @@ from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.views import Task, join_views
 
-__all__ = ["Choice", "FewerQueries", "Inputs", "Shown", "SingleView", "WithBounds", "WithSupport"]
+__all__ = ["Choice", "FarthestSupport", "FewerQueries", "SingleView", "SupportByPosition", "WithBounds", "WithSupport"]
 
 Choice = Literal["first", "farthest", "random"]
 
@@ -121,7 +121,7 @@ class FewerQueries(TaskWrapper):
 
 
 @dataclass(frozen=True)
-class Shown(TaskWrapper):
+class FarthestSupport(TaskWrapper):
     """Tasks whose support views are those farthest apart, and whose query views are some of the original ones.
 
     Attributes:
@@ -143,7 +143,7 @@ class Shown(TaskWrapper):
 
 
 @dataclass(frozen=True)
-class Inputs(TaskWrapper):
+class SupportByPosition(TaskWrapper):
     """Tasks whose support views have given positions in the order of view names; all other views are query views.
 
     It serves protocols that prescribe their input views, such as view 64, or 64 and 128, of SRN's 251.

@@ -18,7 +18,7 @@ from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.data.dataset import read_task
 from hyperplanes.data.packaged import EXAMPLES
-from hyperplanes.data.support import Shown
+from hyperplanes.data.support import FarthestSupport
 from hyperplanes.evaluation import Score
 from hyperplanes.experiments.demonstration.settings import (
     BASELINES,
@@ -69,7 +69,7 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
     for on in dict.fromkeys(cell.on for cell in settings.packaged.cells):
         cells = [cell for cell in settings.packaged.cells if cell.on == on]
         for name in runner.data.evaluated(on, "all", settings.packaged.objects):
-            task = Shown(runner.data.tasks(on), most, QUERY_VIEWS).task(name)
+            task = FarthestSupport(runner.data.tasks(on), most, QUERY_VIEWS).task(name)
             shown = next(runner.pictures(cell, name) for cell in cells if cell.orbit)
             around = np.stack([_read(frame) for frame in picture_paths(settings.first_frames, shown / ORBIT)])
             read, query = range(len(task.support)), range(len(task.query))
