@@ -17,6 +17,7 @@ from torch import Tensor
 from hyperplanes.data.pictures.bounds import estimate_bounds, inverted
 from hyperplanes.data.pictures.images import check_downscale, composite_over_white, reduced
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.cameras import ROTATION_TOLERANCE
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files.reading import DataError
 from hyperplanes.utilities.messages.errors import listed
@@ -24,7 +25,6 @@ from hyperplanes.views import Task, Views
 
 __all__ = ["Posed", "PosedTask", "check_pose", "posed"]
 
-ROTATION_TOLERANCE = 1e-3
 ONE_PLACE = 2.0**-21  # of the distance from the origin: float32 rounding moves cameras at one position this far apart
 MAX_EXTENTS = 1e3  # of a scene: its largest distance from the origin at which float32 is exact to 0.1 pixels
 
