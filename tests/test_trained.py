@@ -355,8 +355,8 @@ def with_symmetry(symmetry):
     return model
 
 
-def test_the_handicap_of_reflections_raises_psnr_if_light_comes_from_one_side(monkeypatch):
-    """Measured: 0.6 dB; without the handicap, reflections of this lamp lower PSNR by 0.5 dB."""
+def test_the_penalty_of_reflections_raises_psnr_if_light_comes_from_one_side(monkeypatch):
+    """Measured: 0.6 dB; without the penalty, reflections of this lamp lower PSNR by 0.5 dB."""
     model = with_symmetry(Symmetry(Plane((0.0, 0.0, 1.0))))
     found = mean_psnr(model, lamp(), 8, 2)
     monkeypatch.setattr(reflections, "REFLECTION_PENALTY", 0.0)

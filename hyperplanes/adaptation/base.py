@@ -27,7 +27,7 @@ from hyperplanes.rendering.refinement import RefinedOccupancy, refine
 from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
 from hyperplanes.rendering.scene import dtype_of, is_thread_safe, mapped
 from hyperplanes.utilities.messages.arguments import checked
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.views import Views
 
@@ -123,7 +123,7 @@ class AdaptedField:
             return self.refined
         weights = self.field.parameters.values() if isinstance(self.field, Field) else ()
         make = partial(refine, self.occupancy, self.density, margin_loss=MARGIN_LOSS)
-        return kept(self, "refined", [self.occupancy.occupied, *weights], make)
+        return cached_on(self, "refined", [self.occupancy.occupied, *weights], make)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without evaluating colour if the field can do that."""

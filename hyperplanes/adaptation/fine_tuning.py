@@ -28,7 +28,7 @@ __all__ = [
     "average_of",
     "fine_tune",
     "fine_tune_to",
-    "made_anyway",
+    "ignoring_no_progress",
     "make_descent",
 ]
 
@@ -50,7 +50,7 @@ class NoProgressError(ValueError):
         self.field = field
 
 
-def made_anyway(make: Callable[[], Made]) -> Made | AdaptedField:
+def ignoring_no_progress(make: Callable[[], Made]) -> Made | AdaptedField:
     """The field after gradient steps, even if they made no progress.
 
     Args:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.context import SupportContext, live_pixels, observe
 from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.symmetry.reflections import UNKNOWN_OPACITY, handicaps, with_reflections
+from hyperplanes.adaptation.symmetry.reflections import UNKNOWN_OPACITY, penalty_offsets, with_reflections
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
@@ -148,7 +148,7 @@ class HyperPlanesNetwork(nn.Module):
         # were masked in training
         planes = self.target.planes_of(views, occupancy)
         if isinstance(planes, VisibilityPlanes) and symmetry is not None:
-            planes = planes.with_handicaps(handicaps(given, symmetry))
+            planes = planes.with_penalty_offsets(penalty_offsets(given, symmetry))
         if self.config.plane_dropout and len(support) < len(views):
             planes = planes.mask_views(self.known_rig.repeated(support).to(device))
 

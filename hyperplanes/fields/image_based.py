@@ -27,7 +27,7 @@ from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.geometry.volume import VALUES_PER_CELL, VOLUME_SIDE, interpolate_grid, resampled_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.messages.arguments import checked_fields
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.transforms import wants_values_alone
 from hyperplanes.views import Views
 
@@ -271,7 +271,9 @@ class ImageBasedField(Field):
         grid = self.parameters.get("grid.weight")
         if grid is None:
             return None
-        return kept(self, "cells", [grid], lambda: grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2))
+        return cached_on(
+            self, "cells", [grid], lambda: grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2)
+        )
 
     def _features(self, points: Tensor) -> list[Float[Tensor, "point number"]]:
         """Features of the grid, the first through a sigmoid."""

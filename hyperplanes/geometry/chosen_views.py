@@ -59,8 +59,8 @@ class Penalties:
     least: float = -MAX_DEPTH_PENALTY
 
     @classmethod
-    def alike(cls) -> Penalties:
-        """Visibility is binary: whatever hides a point costs 1; handicaps and margins are added."""
+    def binary(cls) -> Penalties:
+        """Visibility is binary: whatever hides a point costs 1; penalty offsets and margins are added."""
         return cls(deepest=1e3, partly=1e6, steep=1e6, highest=1.0, least=0.0)
 
 

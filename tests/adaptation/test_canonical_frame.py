@@ -18,7 +18,7 @@ from hyperplanes.adaptation.alignment.canonical_frame import (
 )
 from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.correction.stacking import StackedField
-from hyperplanes.adaptation.fine_tuning import NoProgressError, made_anyway
+from hyperplanes.adaptation.fine_tuning import NoProgressError, ignoring_no_progress
 from hyperplanes.adaptation.optimisation.descent import Descent, split_holdout
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.adaptation.symmetry.reflections import reflected
@@ -242,7 +242,7 @@ def test_a_field_with_fixed_planes_refuses_an_azimuth():
 def test_views_that_auto_holds_out_are_rotated_with_the_others(monkeypatch):
     views, settings, seen = balls(cameras(6, SMALL), BODY), FineTuning(rays=16, max_steps=2), []
     monkeypatch.setattr(Descent, "best_stop", lambda self, holdout, **options: seen.append(holdout) or 1)
-    made_anyway(lambda: model(azimuth=ANGLE, symmetry=ACROSS).fine_tune(views, "auto", settings))
+    ignoring_no_progress(lambda: model(azimuth=ANGLE, symmetry=ACROSS).fine_tune(views, "auto", settings))
     _, expected = split_holdout(Rotation(ANGLE).views(views), settings)
     torch.testing.assert_close(seen[0].cameras.extrinsics, expected.cameras.extrinsics)
 
@@ -251,7 +251,7 @@ def test_views_that_auto_holds_out_are_rotated_with_the_others(monkeypatch):
 def test_the_field_of_unsuccessful_steps_is_in_the_frame_of_the_scene(angle, monkeypatch):
     views, settings = balls(cameras(4, SMALL), BODY), FineTuning(rays=16)
     adapter = model(azimuth=angle, symmetry=ACROSS)
-    expected = made_anyway(lambda: adapter.fine_tune(views, 1, settings))
+    expected = ignoring_no_progress(lambda: adapter.fine_tune(views, 1, settings))
     monkeypatch.setattr(Descent, "errors", lambda self: (0.0, 0.0))
     with pytest.raises(NoProgressError) as caught:
         adapter.fine_tune(views, 1, settings)

@@ -13,7 +13,7 @@ from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
 from hyperplanes.geometry.chosen_views import PENALTY_RADIANS
 from hyperplanes.geometry.occupancy import Occupancy, full
-from hyperplanes.geometry.visibility import penalties as against
+from hyperplanes.geometry.visibility import penalties as view_penalties
 from hyperplanes.geometry.visibility.hull_hits import centres_in_hull
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.rendering import RayMarching
@@ -101,7 +101,7 @@ def test_there_is_no_seam_where_an_image_border_cuts_the_object(monkeypatch, com
         return float(column.diff().abs().max())
 
     smooth = steepest()
-    monkeypatch.setattr(against, "MIN_CROPPED_SHARE", 10.0)  # without the treatment of borders
+    monkeypatch.setattr(view_penalties, "MIN_CROPPED_SHARE", 10.0)  # without the treatment of borders
     assert steepest() > 3 * smooth
 
 

@@ -14,7 +14,7 @@ from hyperplanes.adaptation.alignment import finding_symmetry
 from hyperplanes.adaptation.alignment.rotation import Rotation
 from hyperplanes.adaptation.base import hull
 from hyperplanes.adaptation.fine_tuned import FromScratch
-from hyperplanes.adaptation.fine_tuning import made_anyway
+from hyperplanes.adaptation.fine_tuning import ignoring_no_progress
 from hyperplanes.adaptation.symmetry import detection as symmetry
 from hyperplanes.adaptation.symmetry import judging as judging_symmetry
 from hyperplanes.adaptation.symmetry import reflections
@@ -29,8 +29,8 @@ from hyperplanes.adaptation.symmetry.reflections import (
     OTHER_PLANE_PENALTY,
     REFLECTION_PENALTY,
     UNKNOWN_OPACITY,
-    handicaps,
     images_by,
+    penalty_offsets,
     reflected,
     with_reflections,
 )
@@ -278,7 +278,7 @@ def test_reflected_and_rotated_views_show_the_same_object():
     assert len(found) == 2 * symmetry.images
     truth = balls(found.cameras, around(3, [RED]))
     assert ((found.images - truth.images).abs().amax(1) < 1e-5).float().mean() > 0.999
-    assert handicaps(2, symmetry).tolist() == pytest.approx(
+    assert penalty_offsets(2, symmetry).tolist() == pytest.approx(
         [0.0] * 2 + [REFLECTION_PENALTY] * 2 + [OTHER_PLANE_PENALTY] * 8
     )
 
@@ -357,7 +357,7 @@ def test_the_hull_of_views_and_reflections_prefers_views():
     assert seen.penalty[seen.views >= len(views)].min() == pytest.approx(REFLECTION_PENALTY)
 
 
-def test_a_model_uses_reflections_as_views_with_a_handicap():
+def test_a_model_uses_reflections_as_views_with_a_penalty_offset():
     views = balls(cameras(), BODY)
     symmetric, plain = model(), model()
     plain.config = replace(plain.config, symmetric=False)
@@ -369,7 +369,7 @@ def test_a_model_uses_reflections_as_views_with_a_handicap():
     assert len(plain.prepare(views).planes) == 4
     points = torch.tensor([[0.0, 0.0, 0.4], [0.3, 0.35, 0.0]])
     found = context.planes.choose(points, best=8).best
-    without = context.planes.with_handicaps(torch.zeros(8)).choose(points, best=8).best
+    without = context.planes.with_penalty_offsets(torch.zeros(8)).choose(points, best=8).best
     for row in range(2):
         costs = dict(zip(found.views[row].tolist(), found.penalty[row].tolist(), strict=True))
         plainly = dict(zip(without.views[row].tolist(), without.penalty[row].tolist(), strict=True))
@@ -425,11 +425,11 @@ def test_gradient_steps_draw_rays_of_reflections_only_with_few_views(drawn, give
     assert {count for count, _ in drawn} == {shown}
 
 
-def test_kernels_and_pytorch_choose_the_same_views_with_handicaps(monkeypatch):
+def test_kernels_and_pytorch_choose_the_same_views_with_penalty_offsets(monkeypatch):
     from hyperplanes.geometry.visibility import planes as module
 
     views = ball_views(ring(3, (20, 24)))
-    planes = HullBlend().adapt(views).field.planes.with_handicaps(torch.tensor([0.0, 0.3, 0.1]))
+    planes = HullBlend().adapt(views).field.planes.with_penalty_offsets(torch.tensor([0.0, 0.3, 0.1]))
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     along = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     compiled = planes.choose(points, along, best=3, nearest=2)
@@ -565,7 +565,7 @@ def test_random_weights_use_the_symmetry_that_the_model_finds(monkeypatch, plane
     adapter = model()
     monkeypatch.setattr(adapter, "find_symmetry", lambda support: plane)
     settings = FineTuning(rays=16, learning_rate=1e-4, muon_learning_rate=1e-4)
-    made = made_anyway(lambda: FromScratch(adapter, 1, settings).adapt(balls(cameras(4, SMALL), BODY)))
+    made = ignoring_no_progress(lambda: FromScratch(adapter, 1, settings).adapt(balls(cameras(4, SMALL), BODY)))
     assert made.symmetry == plane
 
 

@@ -159,17 +159,17 @@ def test_the_chosen_views_are_those_of_the_definition(monkeypatch, compiled):
 @pytest.mark.parametrize("compiled", [True, False])
 def test_where_penalties_are_equal_occlusion_decides_alike(monkeypatch, compiled):
     """Points of the surface that each view sees, and that other views see, see from behind or see at an edge."""
-    handicaps = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4])
-    shown = planes(ring(5, SIZE)).with_handicaps(handicaps)
+    offsets = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4])
+    shown = planes(ring(5, SIZE)).with_penalty_offsets(offsets)
     if not compiled:
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     view, row, column = (shown.depth_opacity[..., 1] == 1).nonzero().unbind(1)
     pixels = torch.stack([column, row], 1).float()
     points = cast(shown.colours.cameras, view, pixels, Sphere()).at(shown.depth_opacity[view, row, column, :1])[:, 0]
-    seen = shown.with_penalties(Penalties.alike()).choose(points, best=len(shown)).best
+    seen = shown.with_penalties(Penalties.binary()).choose(points, best=len(shown)).best
     hidden, valid = (seen.behind > shown.tolerance) | (seen.coverage < OPAQUE_MASK), seen.penalty < INVISIBLE_PENALTY
     assert 0.1 < hidden[valid].float().mean() < 0.9  # some are hidden, some are not
-    expected = hidden.float() + handicaps[seen.views]
+    expected = hidden.float() + offsets[seen.views]
     clear = (seen.behind - shown.tolerance).abs() > 1e-5
     torch.testing.assert_close(seen.penalty[valid & clear], expected[valid & clear])
 
@@ -223,7 +223,7 @@ def test_the_margin_is_measured_where_the_lens_shows_a_point():
     views, (points, _) = ball_views(cameras), queries(500)
     given = views.images, views.cameras, views.masks, ball()
     fading_out, whole = VisibilityPlanes(*given), VisibilityPlanes(*given)
-    whole._against = replace(whole._against, margins=torch.zeros_like(whole._against.margins))
+    whole._view_penalties = replace(whole._view_penalties, margins=torch.zeros_like(whole._view_penalties.margins))
     found, plain = (_penalties_of(each.choose(points, best=5).best, 4) for each in (fading_out, whole))
     # by hand: the row in which the lens shows the point, and its position in the margin of the lower border
     matrix = projection_matrices(pinholes)[4]
@@ -271,7 +271,7 @@ def test_depths_of_the_hull_are_computed_once_and_only_if_opacities_do_not_suffi
     by_surface = shown.with_surface(ball(side=32))
     by_surface.choose(points, directions, best=0, nearest=2)
     assert len(computed) == 1  # that of the surface
-    copies = [shown.with_penalties(Penalties.alike()), shown.with_handicaps(torch.zeros(len(shown))), by_surface]
+    copies = [shown.with_penalties(Penalties.binary()), shown.with_penalty_offsets(torch.zeros(len(shown))), by_surface]
     for each in (shown, *copies):
         torch.testing.assert_close(each.choose(points, best=2).coverage, coverage)
     assert len(computed) == 2

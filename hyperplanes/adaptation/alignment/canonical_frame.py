@@ -15,7 +15,7 @@ from hyperplanes.adaptation.alignment.rotation import Rotation
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.network import HyperPlanesNetwork
-from hyperplanes.geometry.kernels.threads import side_by_side
+from hyperplanes.geometry.kernels.threads import map_long_parts
 from hyperplanes.geometry.symmetry.reflections import Symmetry
 from hyperplanes.views import Views
 
@@ -105,7 +105,7 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
     views = network.to_own(support).resized(HELD_OUT_SIZE)
     placed = [Placed(each.views(views), each.symmetry(symmetry, views.bounds), each) for each in rotations]
     trials = [(each, held_out) for each in placed for held_out in range(FOLDS)]
-    found = side_by_side(lambda trial: _quality(network, *trial), trials, views.images.device)
+    found = map_long_parts(lambda trial: _quality(network, *trial), trials, views.images.device)
     qualities = [sum(found[start : start + FOLDS]) / FOLDS for start in range(0, len(found), FOLDS)]
     if not smallest:
         qualities[0] += GAIN

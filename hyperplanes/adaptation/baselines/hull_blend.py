@@ -85,7 +85,7 @@ class HullBlend:
         inside = centres_in_hull(planes, MASK_THRESHOLD - OPACITY_TOLERANCE)
         depth = inside.occupied * (2 * HULL_DENSITY / len(region.occupied))
         voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
-        shown = planes.with_penalties(Penalties.alike()).with_surface(inside)
+        shown = planes.with_penalties(Penalties.binary()).with_surface(inside)
         blend = _Blend(shown, region.bounds, self.nearest)
         sampling = _FirstInHull(self.steps, STOP_TRANSMITTANCE, planes=planes)
         return AdaptedField(blend, region, sampling, densities=(blend.density,), refined=voxels)

@@ -20,7 +20,7 @@ from hyperplanes.adaptation.correction.residuals import are_corrected
 from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
-from hyperplanes.geometry.kernels.threads import at_once
+from hyperplanes.geometry.kernels.threads import run_concurrently
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.parameters import Parameters
@@ -97,7 +97,7 @@ class StackedField(AdaptedField):
         other = partial(self.other.render, cameras, of_other, antialias, mixed_precision=mixed_precision)
         if not (self.thread_safe and self.other.thread_safe):
             return self._mean(own(), other())
-        return self._mean(*at_once(own, other, self.occupancy.occupied.device))
+        return self._mean(*run_concurrently(own, other, self.occupancy.occupied.device))
 
     def _samplers(self, sampling: Sampler | None) -> tuple[Sampler | None, Sampler | None]:
         """The given sampler for whichever of the field and the other one is learned, None for the visual hull."""

@@ -19,8 +19,8 @@ from hyperplanes.adaptation.symmetry.judging import (
     best_vertical_plane,
     carved,
 )
-from hyperplanes.adaptation.symmetry.reflections import HULL_SIDE, handicaps, with_reflections
-from hyperplanes.geometry.kernels.threads import side_by_side
+from hyperplanes.adaptation.symmetry.reflections import HULL_SIDE, penalty_offsets, with_reflections
+from hyperplanes.geometry.kernels.threads import map_long_parts
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Rays
@@ -144,7 +144,9 @@ def _blend(support: Views, symmetry: Symmetry | None, known: Occupancy | None = 
     """`HullBlend` of views, and of their reflections if there is a symmetry; `known` is the hull of the views."""
     blend = HullBlend(side=HULL_SIDE)
     planes = blend.planes_of(with_reflections(support, symmetry, known), known)
-    return blend.adapt_to(planes if symmetry is None else planes.with_handicaps(handicaps(len(support), symmetry)))
+    if symmetry is not None:
+        planes = planes.with_penalty_offsets(penalty_offsets(len(support), symmetry))
+    return blend.adapt_to(planes)
 
 
 def _held_out_gain(support: Views, symmetry: Symmetry) -> float:
@@ -157,7 +159,7 @@ def _held_out_gain(support: Views, symmetry: Symmetry) -> float:
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(0)).tolist()
     folds = [Fold.of(views, sorted(order[fold::ONE_IN])) for fold in range(FOLDS)]
     trials = [(fold, by) for by in (symmetry, None) for fold in folds]  # the longer ones first
-    errors = side_by_side(lambda trial: trial[0].error(trial[1]), trials, views.images.device)
+    errors = map_long_parts(lambda trial: trial[0].error(trial[1]), trials, views.images.device)
     reflected, alone = sum(errors[:FOLDS]), sum(errors[FOLDS:])
     return 10 * math.log10(alone / reflected) if reflected else math.inf
 

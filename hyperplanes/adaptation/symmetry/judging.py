@@ -13,7 +13,7 @@ from torch import Tensor
 from hyperplanes.adaptation.baselines.hull_blend import HullBlend
 from hyperplanes.adaptation.context import live_pixels
 from hyperplanes.adaptation.symmetry.reflections import HULL_SIDE, MIN_OBJECT_OPACITY, images_by
-from hyperplanes.geometry.kernels.threads import side_by_side
+from hyperplanes.geometry.kernels.threads import map_long_parts
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Rays, Sphere, join_rays
 from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
@@ -105,7 +105,7 @@ class SymmetryJudge:
 
     def errors(self, planes: Sequence[Plane], most: float = math.inf) -> dict[Plane, float]:
         """The errors of the planes for which they are finite and at most `most`."""
-        errors = side_by_side(lambda plane: self.error(Symmetry(plane)), planes, self.views.images.device)
+        errors = map_long_parts(lambda plane: self.error(Symmetry(plane)), planes, self.views.images.device)
         found = zip(planes, errors, strict=True)
         return {plane: error for plane, error in found if error <= most and math.isfinite(error)}
 

@@ -19,8 +19,8 @@ __all__ = [
     "HULL_SIDE",
     "MIN_OBJECT_OPACITY",
     "UNKNOWN_OPACITY",
-    "handicaps",
     "images_by",
+    "penalty_offsets",
     "reflected",
     "with_reflections",
 ]
@@ -56,7 +56,7 @@ def images_by(views: Views, symmetry: Symmetry) -> Views:
     return join_views(both, *(moved(both, rotation) for rotation in symmetry.rotations[1:]))
 
 
-def handicaps(given: int, symmetry: Symmetry) -> Float[Tensor, " view"]:
+def penalty_offsets(given: int, symmetry: Symmetry) -> Float[Tensor, " view"]:
     """The penalties of the views of `images_by` as planes.
 
     Args:

@@ -12,22 +12,22 @@ from torch import Tensor
 
 from hyperplanes.geometry.chosen_views import BORDER_MARGIN, BORDER_PENALTY, BORDER_POLE, OPAQUE_MASK, Penalties
 
-__all__ = ["Against", "fading", "margin", "margins"]
+__all__ = ["ViewPenalties", "fading", "margin", "margins"]
 
 MIN_CROPPED_SHARE = 0.02  # of the shorter side: a border with that many object pixels along it crops the object
 
 
 @dataclass(frozen=True)
-class Against:
+class ViewPenalties:
     """The penalties of the views of planes.
 
     Attributes:
-        handicaps: added to the penalty of each view wherever it shows a point.
+        offsets: added to the penalty of each view wherever it shows a point.
         margins: as `margins` returns them.
         penalties: costs of depth and of masks.
     """
 
-    handicaps: Float[Tensor, " view"]
+    offsets: Float[Tensor, " view"]
     margins: Float[Tensor, "view 4"]
     penalties: Penalties
 
@@ -53,7 +53,7 @@ class Against:
         """
         own = self.penalties
         penalty = (own.steep * behind).clamp(own.least, own.deepest)
-        penalty = (penalty + own.partly * (coverage < OPAQUE_MASK)).clamp_max(own.highest) + self.handicaps
+        penalty = (penalty + own.partly * (coverage < OPAQUE_MASK)).clamp_max(own.highest) + self.offsets
         if not self._cut:
             return penalty
         cut = fading(self.margins, coordinates, size)

@@ -37,8 +37,8 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility.first_hits import first_hits
-from hyperplanes.geometry.visibility.penalties import Against, margin, margins
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.geometry.visibility.penalties import ViewPenalties, margin, margins
+from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.transforms import (
     are_plain,
     is_transformed,
@@ -82,7 +82,7 @@ class VisibilityPlanes:
             torch.ones_like(images[:, 0]) if masks is None else masks[:, 0].to(images), cameras, occupancy
         )
         self._surface: Float[Tensor, "view height width 2"] | None = None
-        self._against = Against(
+        self._view_penalties = ViewPenalties(
             images.new_zeros(len(images)),
             images.new_zeros(len(images), 4) if masks is None else margins(masks).to(images),
             Penalties(),
@@ -124,18 +124,18 @@ class VisibilityPlanes:
         """
         return self._with(penalties=penalties)
 
-    def with_handicaps(self, handicaps: Float[Tensor, " view"]) -> VisibilityPlanes:
-        """The same planes with handicaps of the views.
+    def with_penalty_offsets(self, offsets: Float[Tensor, " view"]) -> VisibilityPlanes:
+        """The same planes with penalty offsets of the views.
 
         Args:
-            handicaps: added to the penalty of each view wherever it shows a point.
+            offsets: added to the penalty of each view wherever it shows a point.
         """
-        return self._with(handicaps=handicaps.to(self._against.handicaps))
+        return self._with(offsets=offsets.to(self._view_penalties.offsets))
 
     def _with(self, **changes: Any) -> VisibilityPlanes:
         """The same planes with other view penalties."""
         result = copy.copy(self)
-        result._against = replace(self._against, **changes)
+        result._view_penalties = replace(self._view_penalties, **changes)
         return result
 
     def with_surface(self, voxels: Occupancy) -> VisibilityPlanes:
@@ -191,7 +191,7 @@ class VisibilityPlanes:
 
     def _limits(self) -> list[float]:
         """The parameters of the kernels."""
-        per_radius, own = 1 / self.occupancy.bounds.radius, self._against.penalties
+        per_radius, own = 1 / self.occupancy.bounds.radius, self._view_penalties.penalties
         limits = [
             self.colours.nearest,
             per_radius,
@@ -213,11 +213,11 @@ class VisibilityPlanes:
         ]
 
     def shown_cameras(self) -> Tensor:
-        """What the kernels read of each view: centre, projection matrix, 0 where masked, handicap and margins."""
-        against, masked, cameras = self._against, self.colours.masked, self.colours.cameras
-        poses = kept(self, "poses", [cameras.extrinsics, cameras.intrinsics], self._poses)
+        """What the kernels read of each view: centre, projection matrix, 0 where masked, penalty offset and margins."""
+        penalties, masked, cameras = self._view_penalties, self.colours.masked, self.colours.cameras
+        poses = cached_on(self, "poses", [cameras.extrinsics, cameras.intrinsics], self._poses)
         shown = poses.new_ones(len(self)) if masked is None else (~masked).to(poses)
-        return torch.cat([poses, torch.stack([shown, against.handicaps]), against.margins.T])
+        return torch.cat([poses, torch.stack([shown, penalties.offsets]), penalties.margins.T])
 
     def _poses(self) -> Float[Tensor, "number view"]:
         """Centres and projection matrices."""
@@ -329,7 +329,9 @@ def choose_torch(
     coverage = torch.where(valid, coverage, 1.0)
     # depth behind the surface, in radii, and the penalty of each view
     behind = torch.where(valid, (distances - depth) / planes.occupancy.bounds.radius, 0.0)
-    penalty = planes._against.penalty(behind - planes.tolerance, coverage, found.coordinates, depth_opacity.shape[1:3])
+    penalty = planes._view_penalties.penalty(
+        behind - planes.tolerance, coverage, found.coordinates, depth_opacity.shape[1:3]
+    )
     penalty = torch.where(valid, penalty, INVISIBLE_PENALTY)
 
     def chosen(score: Tensor, count: int) -> ChosenViews:

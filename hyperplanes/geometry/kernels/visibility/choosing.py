@@ -176,13 +176,13 @@ def choose(
     """Writes the chosen views of points start..stop. All arrays are flat.
 
     `cameras` holds 21 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
-    matrix, 0 where it is masked, its handicap, and the pixels of its margins. `maps` (view, row, column, 2) hold depth
-    and opacity. `shape` is the number of views, height, width, the numbers of chosen views, and the pitch; `limits`
-    min_z, 1 / radius, the tolerance, deepest and partly of `chosen_views.Penalties`, OPAQUE_MASK, INVISIBLE_PENALTY,
-    PENALTY_RADIANS, steep, highest, least, 1 / the pixels of a margin, BORDER_PENALTY and BORDER_POLE. `best` and
-    `near` (point, chosen) get indices of views, their values (point, chosen, 6) direction, depth behind the hull,
-    opacity and penalty of each, and `overall` (point, 2) the least opacity and the number of the views that show the
-    point. Where there are no directions nothing is written to `near`.
+    matrix, 0 where it is masked, its penalty offset, and the pixels of its margins. `maps` (view, row, column, 2) hold
+    depth and opacity. `shape` is the number of views, height, width, the numbers of chosen views, and the pitch;
+    `limits` min_z, 1 / radius, the tolerance, deepest and partly of `chosen_views.Penalties`, OPAQUE_MASK,
+    INVISIBLE_PENALTY, PENALTY_RADIANS, steep, highest, least, 1 / the pixels of a margin, BORDER_PENALTY and
+    BORDER_POLE. `best` and `near` (point, chosen) get indices of views, their values (point, chosen, 6) direction,
+    depth behind the hull, opacity and penalty of each, and `overall` (point, 2) the least opacity and the number of the
+    views that show the point. Where there are no directions nothing is written to `near`.
     """
     number = limits.dtype.type
     total, best_count, near_count, pitch = shape[0], shape[3], shape[4], shape[5]
