@@ -26,7 +26,7 @@ from hyperplanes.adaptation.base import Renderable
 from hyperplanes.data import read_task
 from hyperplanes.export.animation import fitted_voxels
 from hyperplanes.export.baking import BakedScene, default_side
-from hyperplanes.export.voxel_fitting import STEPS
+from hyperplanes.export.voxel_fitting import VOXEL_STEPS
 from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task, Views
 
@@ -40,7 +40,9 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks adapting", description=__doc__)
     parser.add_argument("--views", type=Path, help="posed images (default: a procedural car)")
     parser.add_argument("--checkpoint", default="small", help="the model (default: %(default)s)")
-    parser.add_argument("--fit", type=int, nargs="+", default=[STEPS, 2 * STEPS], help="steps for fitting voxels")
+    parser.add_argument(
+        "--fit", type=int, nargs="+", default=[VOXEL_STEPS, 2 * VOXEL_STEPS], help="steps for fitting voxels"
+    )
     parser.add_argument("--side", type=positive, help="voxels per axis (default: as for exported pages)")
     parser.add_argument("--steps", type=int, default=100, help="steps of fine-tuning, the reference; 0 omits it")
     parser.add_argument("--query", type=positive, default=10, help="number of query views (default: %(default)s)")

@@ -22,9 +22,9 @@ from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.base import Pictures
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.data import open_dataset
-from hyperplanes.data.support import Shown
+from hyperplanes.data.support import FarthestSupport
 from hyperplanes.export.baking import BakedScene, bake, default_side
-from hyperplanes.export.voxel_fitting import STEPS, fit_voxels, render_guide
+from hyperplanes.export.voxel_fitting import VOXEL_STEPS, fit_voxels, render_guide
 from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task
 
@@ -39,7 +39,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--objects", type=positive, default=3, help="number of objects per data set")
     parser.add_argument("--query", type=positive, default=3, help="number of query views per object")
     parser.add_argument("--side", type=positive, help="voxels per axis (default: as for exported pages)")
-    parser.add_argument("--fit", type=int, default=STEPS, help="steps for fitting voxels (default: %(default)s)")
+    parser.add_argument("--fit", type=int, default=VOXEL_STEPS, help="steps for fitting voxels (default: %(default)s)")
     parser.add_argument("--quick", action="store_true", help="one object and few steps, to check that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="JSON file to write the rows to")
     chosen = parser.parse_args(arguments)
@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> int:
         data = open_dataset(path)
         names = sorted(data.names("test"))[: chosen.objects]
         for count in chosen.counts:
-            shown = Shown(data, count, chosen.query)
+            shown = FarthestSupport(data, count, chosen.query)
             found = [measure(model, shown.task(name), chosen.side, chosen.fit) for name in names]
             height, width = shown.task(names[0]).support.size
             row: Row = {"name": path.resolve().name, "views": count, "objects": len(names), "size": f"{width}x{height}"}

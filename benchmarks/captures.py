@@ -46,7 +46,7 @@ from hyperplanes.capture import Settings, capture
 from hyperplanes.capture.masks import consistency
 from hyperplanes.capture.masks.background import separate_background
 from hyperplanes.capture.masks.consistency import agree
-from hyperplanes.capture.pipeline import ROOM
+from hyperplanes.capture.pipeline import CARVING_RADII
 from hyperplanes.capture.placement import object_points, object_sphere
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages, fingerprint
@@ -324,7 +324,7 @@ def _damaged(scene: _Scene) -> Row:
     truth, model = scene.truth, scene.model
     masks = damaged_masks([picture[..., 3] / 255 for picture in truth.values()], scene.seed)
     around = object_sphere(model, object_points(model, masks))
-    room = Sphere(around.centre, ROOM * around.radius)
+    room = Sphere(around.centre, CARVING_RADII * around.radius)
     pictures = [read_image(scene.scene / "images" / f"{name}.jpg")[0][..., :3] for name in truth]
     ways = {"damaged": masks}
     for way, most in (("one_word", 0.0), ("vote", consistency.MOST_VOTES)):

@@ -21,7 +21,7 @@ from benchmarks.views import add_data_options, suite_folders
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.data import open_dataset
-from hyperplanes.data.support import Shown
+from hyperplanes.data.support import FarthestSupport
 from hyperplanes.training.gating import GatingExample, example_of, fit_gate, turned
 
 __all__ = ["main"]
@@ -44,7 +44,7 @@ def main(arguments: list[str]) -> int:
         data = open_dataset(path)
         for name in sorted(data.names("test"))[: 1 if chosen.quick else chosen.objects]:
             for upright in (True, False):
-                task = Shown(data, draws.choice(COUNTS), QUERY).task(name)
+                task = FarthestSupport(data, draws.choice(COUNTS), QUERY).task(name)
                 examples.append(example_of(model, task if upright else turned(task, generator)))
         print(f"{path}: {len(examples)} examples", flush=True)
     result = HyperPlanes(replace(model.config, gated=True))

@@ -37,7 +37,7 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.correction.stacking import StackedField
 from hyperplanes.configuration.presets import preset
 from hyperplanes.data import open_dataset
-from hyperplanes.data.support import Shown
+from hyperplanes.data.support import FarthestSupport
 from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.fields.base import Field
 from hyperplanes.geometry import cameras as camera
@@ -101,7 +101,7 @@ def _size_of_ways(sizes: tuple[int, ...]) -> int:
 def _task(data: Tasks, size: int, device: torch.device) -> Task:
     """The first held-out object, with 25 support views and some query views of `size` pixels per side."""
     names = sorted(data.names("test") or data.names("train"))
-    task = _Resized(Shown(data, SHOWN, COMPARED), size).task(names[0])
+    task = _Resized(FarthestSupport(data, SHOWN, COMPARED), size).task(names[0])
     return Task(task.support.to(device), task.query.to(device), task.name)
 
 

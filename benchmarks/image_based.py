@@ -27,7 +27,7 @@ from benchmarks.parts.reporting import Row, finish
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.configuration.presets import ALL_LAYERS, Preset, preset
 from hyperplanes.data.dataset import Dataset, open_dataset, open_datasets
-from hyperplanes.data.support import Shown
+from hyperplanes.data.support import FarthestSupport
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TARGETS, ImageBasedConfig, ImageBasedNeRF
 from hyperplanes.fields.image_based import ImageBasedField
@@ -166,7 +166,8 @@ def main(arguments: list[str]) -> int:
 
 def _judged(model: HyperPlanes, data: Dataset, count: int, objects: int) -> float:
     """Mean PSNR of three query views of each of `objects` held-out objects, from `count` support views."""
-    return evaluate("one_step", model, Shown(data, count, 3), sorted(data.names("test"))[:objects]).mean("psnr")
+    names = sorted(data.names("test"))[:objects]
+    return evaluate("one_step", model, FarthestSupport(data, count, 3), names).mean("psnr")
 
 
 @contextmanager

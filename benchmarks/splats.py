@@ -23,7 +23,7 @@ from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data import read_task
 from hyperplanes.export.baking import BakedScene, bake, default_side
 from hyperplanes.export.splats import fit_splats, splats_of
-from hyperplanes.export.voxel_fitting import STEPS, fit_voxels, render_guide
+from hyperplanes.export.voxel_fitting import VOXEL_STEPS, fit_voxels, render_guide
 from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task
 
@@ -52,7 +52,7 @@ def main(arguments: list[str]) -> int:
     return finish("splats", rows, chosen.json)
 
 
-def measure(model: HyperPlanes, task: Task, voxel_steps: int = STEPS, splat_steps: int = 160) -> Row:
+def measure(model: HyperPlanes, task: Task, voxel_steps: int = VOXEL_STEPS, splat_steps: int = 160) -> Row:
     """Measure one object as a field, as voxels and as splats."""
     shown, asked = task.support, task.query[:COMPARED]
     field = model.adapt(shown).without_residuals()

@@ -47,7 +47,7 @@ from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.adaptation.symmetry.detection import ReflectedHullBlend
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.data import open_dataset
-from hyperplanes.data.support import FewerQueries, Inputs, Shown
+from hyperplanes.data.support import FarthestSupport, FewerQueries, SupportByPosition
 from hyperplanes.data.wrapper import TaskWrapper
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.evaluation.comparison import compare
@@ -131,8 +131,8 @@ def main(arguments: list[str]) -> int:
 def _tasks(data: Tasks, count: int, chosen: argparse.Namespace) -> Tasks:
     """The objects with the views of --inputs, or else with the `count` views that are farthest apart."""
     if not chosen.inputs:
-        return Shown(data, count, chosen.query or QUERY)
-    inputs = Inputs(data, tuple(chosen.inputs))
+        return FarthestSupport(data, count, chosen.query or QUERY)
+    inputs = SupportByPosition(data, tuple(chosen.inputs))
     return FewerQueries(inputs, chosen.query) if chosen.query else inputs
 
 
@@ -148,7 +148,7 @@ def _opened(path: Path, chosen: argparse.Namespace) -> tuple[Tasks, list[str], l
         raise DataError(path, "objects in the test split", "none", "generate it with --held-out")
     if chosen.inputs:
         return data, names, chosen.counts
-    shown = Shown(data, max(chosen.counts), chosen.query or QUERY)
+    shown = FarthestSupport(data, max(chosen.counts), chosen.query or QUERY)
     most = min(len(shown.task(name).support) for name in names)
     counts = [count for count in chosen.counts if count <= most]
     if not counts:

@@ -20,7 +20,7 @@ from hyperplanes.adaptation.base import AdaptedField, Adapter, Renderable
 from hyperplanes.adaptation.baselines.hull_blend import HullBlend
 from hyperplanes.adaptation.baselines.nearest_view import NearestView
 from hyperplanes.adaptation.fine_tuned import FieldFromScratch, FineTuned, FromScratch, random_model, shuffled
-from hyperplanes.adaptation.fine_tuning import made_anyway
+from hyperplanes.adaptation.fine_tuning import ignoring_no_progress
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.adaptation.symmetry.detection import ReflectedHullBlend
@@ -348,4 +348,4 @@ class Unchecked:
 
     def adapt(self, support: Views) -> Renderable:
         """The result of the method for one object."""
-        return made_anyway(lambda: self.adapter.adapt(support))
+        return ignoring_no_progress(lambda: self.adapter.adapt(support))

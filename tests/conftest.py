@@ -55,7 +55,8 @@ if not STARTS_WORKERS:  # the process that starts the workers of `make test` run
 
     from hyperplanes.adaptation.optimisation import learned_steps
 
-    ALL_RAYS, learned_steps.RAYS = learned_steps.RAYS, 128  # a learned step then takes a tenth of the time
+    ALL_RAYS = learned_steps.RAYS_PER_STEP
+    learned_steps.RAYS_PER_STEP = 128  # a learned step then takes a tenth of the time
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def all_rays():
     from hyperplanes.adaptation.optimisation import learned_steps
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learned_steps, "RAYS", ALL_RAYS)
+        patch.setattr(learned_steps, "RAYS_PER_STEP", ALL_RAYS)
         yield
 
 

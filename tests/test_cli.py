@@ -39,7 +39,7 @@ from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.data import DataError, open_dataset, read_task
 from hyperplanes.data.packaged import locate_scene
-from hyperplanes.data.support import FewerQueries, Inputs, WithSupport
+from hyperplanes.data.support import FewerQueries, SupportByPosition, WithSupport
 from hyperplanes.evaluation import evaluate, suitability
 from hyperplanes.export.baking import BakedScene
 from hyperplanes.export.images import to_pixels
@@ -871,7 +871,7 @@ def test_the_views_that_evaluate_gives_to_methods(tmp_path, capsys):
     assert [run["psnr"] for run in draws["seeds"]] == pytest.approx(by_seed)
     assert by_seed[0] != by_seed[1]
     placed = measured("--inputs", "1", "4", "--query", "2")
-    assert placed["psnr"] == pytest.approx(expected(FewerQueries(Inputs(data, (1, 4)), 2)))
+    assert placed["psnr"] == pytest.approx(expected(FewerQueries(SupportByPosition(data, (1, 4)), 2)))
 
 
 @pytest.mark.parametrize(

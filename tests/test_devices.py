@@ -124,7 +124,7 @@ def test_one_forward_pass_gives_the_same_picture():
 
 def test_corrected_pictures_are_the_same(monkeypatch):
     """With stacking, whose weights held-out views decide."""
-    monkeypatch.setattr(held_out, "PIXELS", 128)
+    monkeypatch.setattr(held_out, "HELD_OUT_PIXELS", 128)
 
     def shown(where):
         task = car(where, shown=10)
@@ -181,7 +181,7 @@ def test_symmetry_planes_are_the_same():
 
 
 def test_errors_of_symmetry_planes_are_the_same(monkeypatch):
-    monkeypatch.setattr(symmetry, "PIXELS", 256)
+    monkeypatch.setattr(symmetry, "PIXELS_PER_FOLD", 256)
     monkeypatch.setattr(symmetry, "carved", partial(carved, side=24))
     for module in (symmetry, reflections):
         monkeypatch.setattr(module, "HULL_SIDE", 24)

@@ -76,7 +76,7 @@ def test_training_with_no_process_is_refused(option, tmp_path, capsys):
 def test_available_memory_is_known_and_small_amounts_are_not_checked(monkeypatch):
     assert 0 < memory.available_memory() < 2**50
     monkeypatch.setattr(memory, "available_memory", lambda: 0)
-    memory.require_memory("views", 3, memory.SMALL, "take fewer")
+    memory.require_memory("views", 3, memory.UNCHECKED_BYTES, "take fewer")
     with pytest.raises(ValueError, match=r"views: expected a size that fits .* 0\.0 GB .* got 3, which needs 5 GB"):
         memory.require_memory("views", 3, 5e9, "take fewer")
 

@@ -154,7 +154,8 @@ def test_no_method_reads_a_pixel_of_the_query_views(folders, monkeypatch):
     quick = PRESETS["quick"]
     monkeypatch.setitem(PRESETS, "quick", replace(quick, model=small_model(hypernetwork=None).config))
     monkeypatch.setattr(methods, "HullBlend", partial(HullBlend, side=8, steps=16))
-    monkeypatch.setattr(judging_symmetry, "MOST_PIXELS", 2 * 4 * 12 * 12)  # enough for the reflections about one plane
+    enough = 2 * 4 * 12 * 12  # for the reflections about one plane
+    monkeypatch.setattr(judging_symmetry, "MAX_REFLECTED_PIXELS", enough)
     clean, data = Balls(test=2, size=(12, 12)), Balls(test=2, size=(12, 12))
     original, read = data.task, []
 

@@ -250,7 +250,7 @@ def car(number, count):
 def after_learned_steps():
     """PSNR of `shape` from 3 views after four learned steps, with a quarter of the default rays."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learned_steps, "RAYS", QUARTER)
+        patch.setattr(learned_steps, "RAYS_PER_STEP", QUARTER)
         return mean_psnr(coarse("small", learned_steps=4), shape(), 3)
 
 
@@ -285,7 +285,7 @@ def test_learned_steps_raise_psnr_because_of_the_gradient_that_they_read(monkeyp
     """Measured: 17.9 dB without learned steps, 22.2 dB with four; 15.4 dB with random numbers instead of the gradient,
     and 13.2 dB with its negative; with a quarter of the default rays.
     """
-    monkeypatch.setattr(learned_steps, "RAYS", QUARTER)
+    monkeypatch.setattr(learned_steps, "RAYS_PER_STEP", QUARTER)
     model, task, found = coarse("small", learned_steps=4), shape(), {"all": after_learned_steps()}
     for name, change in (("random", torch.randn_like), ("negative", torch.neg)):
         monkeypatch.setattr(learned_steps, "grid_gradient", partial(_changed, grid_gradient, change))
@@ -308,7 +308,7 @@ def test_few_gradient_steps_on_few_views_after_learned_steps_do_not_lower_psnr_m
 
     Both are with a quarter of the default rays. With all rays, the first are 22.5 dB before and 22.7 dB after.
     """
-    monkeypatch.setattr(learned_steps, "RAYS", QUARTER)
+    monkeypatch.setattr(learned_steps, "RAYS_PER_STEP", QUARTER)
     task, settings = shape(), FineTuning(rays=256)
     begun, plain = (coarse("small", learned_steps=steps) for steps in (4, 0))
     found = [quality(model.fine_tune(few(task, 3), 10, settings), task) for model in (begun, plain)]
@@ -355,11 +355,11 @@ def with_symmetry(symmetry):
     return model
 
 
-def test_the_handicap_of_reflections_raises_psnr_if_light_comes_from_one_side(monkeypatch):
-    """Measured: 0.6 dB; without the handicap, reflections of this lamp lower PSNR by 0.5 dB."""
+def test_the_penalty_of_reflections_raises_psnr_if_light_comes_from_one_side(monkeypatch):
+    """Measured: 0.6 dB; without the penalty, reflections of this lamp lower PSNR by 0.5 dB."""
     model = with_symmetry(Symmetry(Plane((0.0, 0.0, 1.0))))
     found = mean_psnr(model, lamp(), 8, 2)
-    monkeypatch.setattr(reflections, "HANDICAP", 0.0)
+    monkeypatch.setattr(reflections, "REFLECTION_PENALTY", 0.0)
     assert found > mean_psnr(model, lamp(), 8, 2) + 0.3
 
 

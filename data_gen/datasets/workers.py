@@ -33,7 +33,7 @@ __all__ = [
     "worker_environment",
 ]
 
-ATTEMPTS = 2
+MAX_ATTEMPTS = 2
 """How often an item is tried if its worker crashes."""
 
 START_SECONDS = 120.0
@@ -213,7 +213,7 @@ class _Current:
 
     def _answer(self, item: dict[str, Any]) -> dict[str, Any]:
         answer: dict[str, Any] = {}
-        for attempt in range(1, ATTEMPTS + 1):
+        for attempt in range(1, MAX_ATTEMPTS + 1):
             if self._worker is None:
                 self._worker, self._left = self._open(), self._recycle
             try:

@@ -21,9 +21,9 @@ from data_gen.rendering.renderers import REMEDIES, RENDERERS, RendererError, fin
 from data_gen.rendering.surfaces import RenderError, ShadedSurface, shaded_surfaces
 from data_gen.rigs import Rig
 
-__all__ = ["CHANNELS", "MAX_SUPERSAMPLE", "MeshRenderer", "RenderError", "Rendering", "ViewRenderer"]
+__all__ = ["MAX_SUPERSAMPLE", "RENDER_CHANNELS", "MeshRenderer", "RenderError", "Rendering", "ViewRenderer"]
 
-CHANNELS = ("rgba", "depth", "normals", "coordinates")
+RENDER_CHANNELS = ("rgba", "depth", "normals", "coordinates")
 """What `render` can return."""
 
 MAX_SUPERSAMPLE = 8
@@ -110,7 +110,7 @@ class MeshRenderer:
             parts: meshes in world coordinates, as for `shaded_surfaces`.
             rig: the cameras.
             lighting: name of a preset or a Lighting.
-            channels: what to return, of CHANNELS.
+            channels: what to return, of RENDER_CHANNELS.
             name: name of the object in errors.
             seed: seed of random lighting.
 
@@ -121,9 +121,11 @@ class MeshRenderer:
             RenderError: if the parts cannot be drawn, or nothing of them is visible in any view.
             ValueError: if the lighting or a channel is unknown.
         """
-        unknown = sorted(set(channels) - set(CHANNELS))
+        unknown = sorted(set(channels) - set(RENDER_CHANNELS))
         if unknown or not channels:
-            raise ValueError(f"channels: expected some of {', '.join(CHANNELS)}, got {', '.join(channels) or 'none'}")
+            raise ValueError(
+                f"channels: expected some of {', '.join(RENDER_CHANNELS)}, got {', '.join(channels) or 'none'}"
+            )
         lights = resolve_lighting(lighting, seed=seed)
         surfaces = shaded_surfaces(parts, name)
         pictures: dict[str, npt.NDArray] = {}
@@ -134,7 +136,7 @@ class MeshRenderer:
             from data_gen.rendering.ray_tracing.embree import cast_geometry
 
             views = list(cast_geometry(surfaces, rig))
-            for channel in CHANNELS[1:]:
+            for channel in RENDER_CHANNELS[1:]:
                 if channel in channels:
                     pictures[channel] = np.stack([getattr(view, channel) for view in views])
             if "rgba" not in channels:

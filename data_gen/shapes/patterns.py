@@ -12,7 +12,7 @@ from data_gen.shapes.materials import Colour, Material, brighten, pixel_centres
 
 __all__ = ["PRINTS", "checks", "dots", "lines", "noise", "print_of", "stripes", "weave", "wheel_face", "wood"]
 
-SIZE = 112
+TEXTURE_SIZE = 112
 """Width and height of a texture in pixels."""
 
 
@@ -23,9 +23,9 @@ def _mix(first: Colour, second: Colour, share: np.ndarray) -> np.ndarray:
 
 
 def noise(rng: np.random.Generator, cells: tuple[int, int]) -> np.ndarray:
-    """Smooth noise (SIZE, SIZE) in [0, 1]: random values on a (v, u) lattice of that many cells, interpolated."""
+    """Smooth noise (v, u) in [0, 1]: random values on a lattice of that many cells, interpolated."""
     lattice = rng.random((cells[0] + 1, cells[1] + 1))
-    rows, columns = np.linspace(0, cells[0], SIZE), np.linspace(0, cells[1], SIZE)
+    rows, columns = np.linspace(0, cells[0], TEXTURE_SIZE), np.linspace(0, cells[1], TEXTURE_SIZE)
     r, c = np.minimum(rows.astype(int), cells[0] - 1), np.minimum(columns.astype(int), cells[1] - 1)
     fr, fc = (rows - r)[:, None], (columns - c)[None]
     fr, fc = fr * fr * (3 - 2 * fr), fc * fc * (3 - 2 * fc)
@@ -36,7 +36,7 @@ def noise(rng: np.random.Generator, cells: tuple[int, int]) -> np.ndarray:
 
 def wood(rng: np.random.Generator, colour: Colour, boards: int = 1) -> Material:
     """Grain along v, in one or several boards side by side along u with dark joints."""
-    u, v = pixel_centres(SIZE, SIZE)
+    u, v = pixel_centres(TEXTURE_SIZE, TEXTURE_SIZE)
     board = np.floor(u * boards)
     warp = noise(rng, (3, 6)) + 0.35 * noise(rng, (5, 24))
     phase = rng.uniform(0, 6, boards)[board.astype(int)]
@@ -51,7 +51,7 @@ def wood(rng: np.random.Generator, colour: Colour, boards: int = 1) -> Material:
 
 def weave(rng: np.random.Generator, colour: Colour) -> Material:
     """Coarse woven cloth: a basket pattern with soft mottling."""
-    u, v = pixel_centres(SIZE, SIZE)
+    u, v = pixel_centres(TEXTURE_SIZE, TEXTURE_SIZE)
     count = int(rng.integers(9, 16))
     across, along = np.sin(np.pi * count * u) ** 2, np.sin(np.pi * count * v) ** 2
     odd = (np.floor(u * count) + np.floor(v * count)) % 2 == 0
@@ -61,7 +61,7 @@ def weave(rng: np.random.Generator, colour: Colour) -> Material:
 
 def stripes(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """Stripes along v of unequal width."""
-    u, _ = pixel_centres(SIZE, SIZE)
+    u, _ = pixel_centres(TEXTURE_SIZE, TEXTURE_SIZE)
     count, share = int(rng.integers(3, 8)), rng.uniform(0.3, 0.6)
     place = (u * count + 0.25) % 1
     thin = np.abs(place - (1 + share) / 2) < 0.05
@@ -70,7 +70,7 @@ def stripes(rng: np.random.Generator, first: Colour, second: Colour) -> Material
 
 def checks(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """Gingham: two sets of stripes whose crossings are darker."""
-    u, v = pixel_centres(SIZE, SIZE)
+    u, v = pixel_centres(TEXTURE_SIZE, TEXTURE_SIZE)
     count = int(rng.integers(3, 7))
     across, along = (u * count + 0.25) % 1 < 0.5, (v * count + 0.25) % 1 < 0.5
     return Material("checks", _mix(first, second, 0.5 * across + 0.5 * along))
@@ -78,7 +78,7 @@ def checks(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
 
 def dots(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """Staggered round spots."""
-    u, v = pixel_centres(SIZE, SIZE)
+    u, v = pixel_centres(TEXTURE_SIZE, TEXTURE_SIZE)
     count, radius = int(rng.integers(4, 8)), rng.uniform(0.2, 0.32)
     row = np.floor(v * count)
     x, y = (u * count + 0.5 * (row % 2)) % 1 - 0.5, v * count - row - 0.5
@@ -87,7 +87,7 @@ def dots(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
 
 def lines(rng: np.random.Generator, first: Colour, second: Colour) -> Material:
     """Zigzag lines across v."""
-    u, v = pixel_centres(SIZE, SIZE)
+    u, v = pixel_centres(TEXTURE_SIZE, TEXTURE_SIZE)
     count, teeth = int(rng.integers(4, 8)), int(rng.integers(3, 7))
     place = (v * count + 0.45 * np.abs((u * teeth) % 1 * 2 - 1)) % 1
     return Material("zigzag", _mix(first, second, place < rng.uniform(0.35, 0.55)))

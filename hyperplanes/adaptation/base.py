@@ -28,15 +28,15 @@ from hyperplanes.rendering.renderer import FieldFunction, Sampler, render
 from hyperplanes.rendering.scene import dtype_of, is_thread_safe, mapped
 from hyperplanes.utilities.messages.arguments import checked
 from hyperplanes.utilities.messages.errors import listed
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.views import Views
 
 __all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "attributes_of", "check_masks", "hull"]
 
 MARGIN_LOSS = 0.9  # `margin_loss` of `refine`: 2.4 % in one voxel
-HAZY = 0.5  # of the pixels of a mask: a larger share with an opacity of less than MIN_MASK_OPACITY is refused
-POINTS = 1 << 12  # per thread, for densities
+MAX_HAZY_SHARE = 0.5  # of the pixels of a mask: a larger share with an opacity of less than MIN_MASK_OPACITY is refused
+DENSITY_CHUNK = 1 << 12  # per thread, for densities
 
 
 @runtime_checkable
@@ -125,14 +125,14 @@ class AdaptedField:
             return self.refined
         weights = self.field.parameters.values() if isinstance(self.field, Field) else ()
         make = partial(refine, self.occupancy, self.density, margin_loss=MARGIN_LOSS)
-        return kept(self, "refined", [self.occupancy.occupied, *weights], make)
+        return cached_on(self, "refined", [self.occupancy.occupied, *weights], make)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without evaluating colour if the field can do that."""
         points = as_points(points)
         own = points.to(self.dtype)
         if self.thread_safe and points.device.type == "cpu" and not torch.is_grad_enabled():
-            return torch.cat(list(parallel_map(self._density, own.split(POINTS)))).to(points.dtype)
+            return torch.cat(list(parallel_map(self._density, own.split(DENSITY_CHUNK)))).to(points.dtype)
         return self._density(own).to(points.dtype)
 
     def _density(self, points: Tensor) -> Tensor:
@@ -264,7 +264,7 @@ def check_masks(support: Views) -> None:
             "leave these views out or correct their masks"
         )
     # as much of faint opacity is no edge
-    hazy = ((flat > 0) & (flat < MIN_MASK_OPACITY)).float().mean(1) > HAZY
+    hazy = ((flat > 0) & (flat < MIN_MASK_OPACITY)).float().mean(1) > MAX_HAZY_SHARE
     if hazy.any():
         least = float(flat[hazy].median())
         raise ValueError(

@@ -28,13 +28,14 @@ __all__ = [
     "average_of",
     "fine_tune",
     "fine_tune_to",
-    "made_anyway",
+    "ignoring_no_progress",
     "make_descent",
 ]
 
 Made = TypeVar("Made")
 
-NEARLY = 0.99  # of the error of an empty picture, which rounding may change for a field that has lost everything
+# of the error of an empty picture, which rounding may change for a field that has lost everything
+EMPTY_ERROR_FRACTION = 0.99
 
 
 class NoProgressError(ValueError):
@@ -49,7 +50,7 @@ class NoProgressError(ValueError):
         self.field = field
 
 
-def made_anyway(make: Callable[[], Made]) -> Made | AdaptedField:
+def ignoring_no_progress(make: Callable[[], Made]) -> Made | AdaptedField:
     """The field after gradient steps, even if they made no progress.
 
     Args:
@@ -169,7 +170,7 @@ def fine_tune_to(
     after, empty = descent.errors()
     with torch.no_grad():
         made = tuned_field(network, context, descent.weights(), *average)
-    if not after < max(before, empty * NEARLY):
+    if not after < max(before, empty * EMPTY_ERROR_FRACTION):
         raise NoProgressError(
             f"fine-tuning: expected {steps} steps to lower the squared error, {before:.3g}, got {after:.3g}, where an "
             f"empty picture has {empty:.3g}; lower learning_rate and muon_learning_rate, or take the field of 0 steps",

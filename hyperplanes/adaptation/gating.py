@@ -14,7 +14,7 @@ from hyperplanes.rendering.compositing import Rendered
 
 __all__ = ["GatingNetwork", "readings"]
 
-HIDDEN = 16
+HIDDEN_WIDTH = 16
 READINGS = 9  # inputs for a pixel
 BIAS = -2.0  # initial bias of the logit: a share of an eighth
 
@@ -29,7 +29,7 @@ class GatingNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.Sequential(nn.Linear(READINGS, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 1))
+        self.layers = nn.Sequential(nn.Linear(READINGS, HIDDEN_WIDTH), nn.ReLU(), nn.Linear(HIDDEN_WIDTH, 1))
         last = self.layers[-1]
         assert isinstance(last, nn.Linear)
         nn.init.constant_(last.bias, BIAS)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.context import SupportContext, live_pixels, observe
 from hyperplanes.adaptation.gating import GatingNetwork
-from hyperplanes.adaptation.symmetry.reflections import UNKNOWN, handicaps, with_reflections
+from hyperplanes.adaptation.symmetry.reflections import UNKNOWN_OPACITY, penalty_offsets, with_reflections
 from hyperplanes.configuration.compatibility import check_model
 from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.fields import Target
@@ -28,9 +28,9 @@ from hyperplanes.utilities.messages.arguments import checked
 from hyperplanes.utilities.tensors.seeding import seeded
 from hyperplanes.views import Views
 
-__all__ = ["GRID", "HyperPlanesNetwork", "in_use"]
+__all__ = ["GRID_WEIGHT", "HyperPlanesNetwork", "in_use"]
 
-GRID = "fine.grid.weight"
+GRID_WEIGHT = "fine.grid.weight"
 """The grid of features of a field, among its weights."""
 
 
@@ -67,7 +67,7 @@ class HyperPlanesNetwork(nn.Module):
             self.learned_step: LearnedStep | None = None
             if config.learned_steps:
                 assert self.target.volume_size is not None  # `check_model`
-                self.learned_step = LearnedStep(self.target.volume_size[1], self.theta[GRID].shape[0])
+                self.learned_step = LearnedStep(self.target.volume_size[1], self.theta[GRID_WEIGHT].shape[0])
         self.register_buffer("rig", torch.zeros(self.target.rig_size, 3))
 
     @property
@@ -148,7 +148,7 @@ class HyperPlanesNetwork(nn.Module):
         # were masked in training
         planes = self.target.planes_of(views, occupancy)
         if isinstance(planes, VisibilityPlanes) and symmetry is not None:
-            planes = planes.with_handicaps(handicaps(given, symmetry))
+            planes = planes.with_penalty_offsets(penalty_offsets(given, symmetry))
         if self.config.plane_dropout and len(support) < len(views):
             planes = planes.mask_views(self.known_rig.repeated(support).to(device))
 
@@ -247,7 +247,7 @@ class HyperPlanesNetwork(nn.Module):
         pixels = live_pixels(context.occupancy, views)
         if context.symmetry is None or views.masks is None:
             return pixels
-        return pixels[views.masks.flatten()[pixels] != views.masks.new_tensor(UNKNOWN)]
+        return pixels[views.masks.flatten()[pixels] != views.masks.new_tensor(UNKNOWN_OPACITY)]
 
 
 _in_use: dict[nn.Module, tuple[int, bool]] = {}

@@ -34,9 +34,9 @@ from hyperplanes.utilities.images.sizes import scaled_size
 from hyperplanes.utilities.messages.errors import listed
 from hyperplanes.utilities.messages.formatting import counted
 
-__all__ = ["FEWEST", "Photograph", "find_photographs", "list_photographs", "read_upright", "without_copies"]
+__all__ = ["MIN_PHOTOGRAPHS", "Photograph", "find_photographs", "list_photographs", "read_upright", "without_copies"]
 
-FEWEST = 3
+MIN_PHOTOGRAPHS = 3
 """Least number of photographs from which poses can be found."""
 
 _LOOKED_AT = 1000  # most entries of a folder that are searched
@@ -96,8 +96,8 @@ def find_photographs(folder: Path) -> list[Path]:
         )
     pictures = heif + [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
     found = sorted(pictures, key=lambda path: natural_order(path.name))
-    if len(found) < FEWEST:
-        wanted = f"at least {FEWEST} photographs of one object"
+    if len(found) < MIN_PHOTOGRAPHS:
+        wanted = f"at least {MIN_PHOTOGRAPHS} photographs of one object"
         raise DataError(folder, wanted, counted(len(found), "photograph"), _elsewhere(folder))
     return found
 

@@ -14,7 +14,7 @@ from hyperplanes.capture.masks.choice import check_mask, choose_masker
 from hyperplanes.capture.masks.consistency import agree
 from hyperplanes.capture.packages import is_installed, require
 from hyperplanes.capture.photographs import (
-    FEWEST,
+    MIN_PHOTOGRAPHS,
     Photograph,
     find_photographs,
     list_photographs,
@@ -41,12 +41,12 @@ __all__ = ["Captured", "Progress", "Settings", "capture"]
 WORK = "capture"
 """The folder in the scene that holds the results of the stages."""
 
-ROOM = 1.5
+CARVING_RADII = 1.5
 """Radii of the sphere around the object's sparse points: the sphere in which its hull is carved. It is larger than the
 points' sphere because smooth parts of the object have no points."""
 
-ENOUGH = 0.8  # of the photographs: if fewer get a pose, a note gives advice
-QUALITY = 96  # of JPEG, without chroma subsampling
+MIN_POSED_SHARE = 0.8  # of the photographs: if fewer get a pose, a note gives advice
+JPEG_QUALITY = 96  # of JPEG, without chroma subsampling
 
 ADVICE = (
     "walk around the object in small steps, 20 degrees or less, so that neighbouring photographs show mostly the same, "
@@ -54,7 +54,7 @@ ADVICE = (
     "such as a newspaper under it"
 )
 
-FRAMES = 60
+VIDEO_FRAMES = 60
 """Frames that are taken from a video."""
 
 
@@ -73,7 +73,7 @@ class Settings:
 
     max_size: Annotated[int, range(64, 1 << 16)] = 1000
     mask: str = "auto"
-    frames: Annotated[int, range(3, 1 << 16)] = FRAMES
+    frames: Annotated[int, range(3, 1 << 16)] = VIDEO_FRAMES
     order: Literal["auto", "sequence", "any"] = "auto"
 
 
@@ -158,10 +158,10 @@ def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
     photographs, copies = without_copies(photographs)
     notes += copies
     work.notes += notes
-    if len(photographs) < FEWEST:
+    if len(photographs) < MIN_PHOTOGRAPHS:
         found = f"{len(photographs)} of {len(paths)}"
         found += f" ({'; '.join(notes)})" if notes else ""
-        wanted = f"at least {FEWEST} different photographs that can be read"
+        wanted = f"at least {MIN_PHOTOGRAPHS} different photographs that can be read"
         raise DataError(source, wanted, found, "add photographs from other viewpoints")
     return photographs, is_video
 
@@ -194,7 +194,7 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
                 done["broken"][str(index)] = f"left out: {error}"
                 done["sizes"].append(None)
                 continue
-            write_whole(folder / f"{index:05d}.jpg", encode_jpeg(picture, QUALITY), durable=False)
+            write_whole(folder / f"{index:05d}.jpg", encode_jpeg(picture, JPEG_QUALITY), durable=False)
             done["sizes"].append(list(picture.shape[:2]))
             if masked and opacity is not None:
                 write_whole(folder / f"{index:05d}.mask.png", encode_png(opacity), durable=False)
@@ -256,15 +256,15 @@ def _poses(pictures: list[Picture], is_video: bool, work: _Work) -> SparseModel:
         )
         if found is not None and (best is None or len(found) > len(best)):
             best = found
-    if best is None or len(best) < FEWEST:
+    if best is None or len(best) < MIN_PHOTOGRAPHS:
         found = f"{len(pictures)} of which none can" if best is None else f"only {len(best)} of {len(pictures)}"
         raise DataError(
             work.stages.folder.parent,
-            f"photographs of which at least {FEWEST} can be posed together",
+            f"photographs of which at least {MIN_PHOTOGRAPHS} can be posed together",
             "; ".join([found, *work.notes]),
             ADVICE,
         )
-    if len(best) < ENOUGH * len(pictures):
+    if len(best) < MIN_POSED_SHARE * len(pictures):
         notes.append(f"few photographs could be posed; for the next time: {ADVICE}")
     best.save(folder / "model.npz")
     for database in folder.glob("*.db*"):
@@ -349,7 +349,7 @@ def _placed(
         work.progress("agreement", 0, 1, "of the masks with each other")
         own = [opacity is not None for opacity in given]
         pictures = None if all(own) or not is_installed("cv2") else straight
-        found = agree(masks, model, Sphere(sphere.centre, ROOM * sphere.radius), pictures)
+        found = agree(masks, model, Sphere(sphere.centre, CARVING_RADII * sphere.radius), pictures)
         for kept, done in ((True, "to be checked"), (False, "corrected by what the others show")):
             if names := [photographs[row].name for row in found.wrong if own[row] == kept]:
                 work.notes.append(
@@ -380,7 +380,7 @@ def _written(
     files = {}
     for row, (one, picture) in enumerate(zip(photographs, straight, strict=True)):
         work.progress("writing", row, len(straight), one.name)
-        files[f"images/{one.name}.jpg"] = encode_jpeg(picture, QUALITY)
+        files[f"images/{one.name}.jpg"] = encode_jpeg(picture, JPEG_QUALITY)
         if masks is not None:
             files[f"masks/{one.name}.png"] = encode_png((masks[row] * 255).round().astype(np.uint8))
     captured = write_scene(

@@ -22,8 +22,8 @@ INSIDE = 0.8  # of the cameras that observe a point must have it in their masks
 OUTLIER = 3.0  # median distances to the 8th neighbour: a point whose own is larger is an outlier
 NEIGHBOURS = 8
 FEWEST_POINTS = 30
-MARGIN = 1.1  # radii of the sphere around the points: parts of the object without points may lie outside it
-LEVEL = np.deg2rad(20)  # largest angle between the normal of the cameras' x axes and the mean up direction
+RADIUS_FACTOR = 1.1  # radii of the sphere around the points: parts of the object without points may lie outside it
+MAX_TILT = np.deg2rad(20)  # largest angle between the normal of the cameras' x axes and the mean up direction
 SPREAD = 4.0  # least ratio of the two smallest eigenvalues of the x axes' scatter matrix for their normal to be used
 # of the ground plane: distance of its points in radii of the sphere, angle to the up direction, and share of the points
 PLANE_NEAR, PLANE_LEVEL, PLANE_SHARE = 0.01, np.deg2rad(12), 0.15
@@ -95,7 +95,7 @@ def object_sphere(model: SparseModel, chosen: Bool[np.ndarray, " point"]) -> Sph
         centre = nearest_point(eyes, axes)
         return Sphere(tuple(centre.tolist()), 0.4 * float((eyes - centre).norm(dim=-1).median()))
     ball = smallest_ball(torch.from_numpy(points))
-    return Sphere(ball.centre, MARGIN * ball.radius)
+    return Sphere(ball.centre, RADIUS_FACTOR * ball.radius)
 
 
 def find_up(
@@ -131,7 +131,7 @@ def find_up(
     right = np.einsum("cij,ci->cj", rotations, across)
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     level = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
-    if level @ up > np.cos(LEVEL) and values[1] > SPREAD * max(values[0], 1e-6):
+    if level @ up > np.cos(MAX_TILT) and values[1] > SPREAD * max(values[0], 1e-6):
         up, source = level, "the cameras' horizon"
     plane = _ground(model.points[~chosen], up, sphere)
     return (plane, "the plane that the object stands on") if plane is not None else (up, source)

@@ -31,16 +31,16 @@ LEVELS = ((32, 32, 200), (64, 48, 200), (128, 64, 200))
 """Pixels along the longer side of the pictures, cells of the grid along an axis, and steps."""
 
 FEWEST_VIEWS = 5
-RAYS = 2048
+RAYS_PER_STEP = 2048
 GRID_RATE, POSE_RATE = 0.2, 5e-3  # of Adam
 FIXED = 40  # steps before the cameras move: the first grid is too large and would misplace them
 FINAL_RATE = 0.1  # fraction of the rate of the poses at the last step
-SAMPLES = 1.5  # along a ray, per cell of the grid along an axis
-OUTSIDE, INSIDE = -6.0, 0.0  # initial values of the grid, before softplus: optical depth of a cell
-UNKNOWN = -3.0  # the same without masks
-EMPTY = 0.02  # optical depth up to which cells are skipped, if they are more than two cells from others
+SAMPLES_PER_CELL = 1.5  # along a ray, per cell of the grid along an axis
+INITIAL_OUTSIDE, INITIAL_INSIDE = -6.0, 0.0  # initial values of the grid, before softplus: optical depth of a cell
+INITIAL_WITHOUT_MASKS = -3.0  # the same without masks
+MIN_OPTICAL_DEPTH = 0.02  # optical depth up to which cells are skipped, if they are more than two cells from others
 VOTES = 0.2  # fraction of the masks that must exclude a cell to carve it, as some poses are wrong
-MARGIN = 0.08  # distance from the masks within which rays are drawn, as a fraction of the longer side of an image
+MASK_MARGIN = 0.08  # distance from the masks within which rays are drawn, as a fraction of the longer side of an image
 
 Grid = Float[Tensor, "channel x y z"]
 
@@ -119,13 +119,13 @@ def refine_poses(views: Views, *, on_step: Callable[[int, int], None] | None = N
         small = views.resized(pixels)
         among = _near_masks(small)
         grid = resampled_grid(grid.detach(), side)
-        occupancy = Occupancy(softplus(grid[0]) > EMPTY, views.bounds).dilated(2)
+        occupancy = Occupancy(softplus(grid[0]) > MIN_OPTICAL_DEPTH, views.bounds).dilated(2)
         grid = grid.clone().requires_grad_(True)
         content = Adam([grid], lr=GRID_RATE, betas=(0.9, 0.99))
         for _ in range(steps):
             # rays of the current cameras, and the error of the grid
             shown = replace(small, cameras=camera.resized(cameras(), *small.size))
-            rays, truth, opacity = shown.sample_masked_rays(RAYS, generator=generator, among=among)
+            rays, truth, opacity = shown.sample_masked_rays(RAYS_PER_STEP, generator=generator, among=among)
             loss = _loss(grid, occupancy, rays, truth, None if views.masks is None else opacity[:, 0], generator)
             for optimiser in (content, motion):
                 optimiser.zero_grad()
@@ -153,7 +153,7 @@ def _loss(
     hit: Bool[Tensor, " ray"] = rays.far > rays.near
     near, length = rays.near[hit][:, None], (rays.far - rays.near)[hit][:, None]
     # one sample in each interval of a ray, (ray, sample), and which of them lie in non-empty cells
-    count = int(SAMPLES * grid.shape[1])
+    count = int(SAMPLES_PER_CELL * grid.shape[1])
     edges = torch.linspace(0, 1, count + 1)
     where = near + length * (edges[:-1] + torch.rand(len(near), count, generator=generator) / count)
     points = rays.origins[hit][:, None] + where[..., None] * rays.directions[hit][:, None]
@@ -171,17 +171,17 @@ def _near_masks(views: Views) -> Int[Tensor, " pixel"] | None:
     """Flat indices (view, row, column) of the pixels in the masks and around them; None without masks."""
     if views.masks is None:
         return None
-    reach = max(1, round(MARGIN * max(views.size)))
+    reach = max(1, round(MASK_MARGIN * max(views.size)))
     return max_pool2d(views.masks, 2 * reach + 1, 1, reach).flatten().nonzero()[:, 0]
 
 
 def _first_grid(views: Views, side: int) -> Grid:
     """A grey visual hull, from which a cell is carved by several masks, or thin fog without masks."""
     grid = torch.zeros(4, side, side, side)
-    grid[0] = UNKNOWN
+    grid[0] = INITIAL_WITHOUT_MASKS
     if views.masks is not None:
         small = views.resized(64)
         assert small.masks is not None
         hull = carve(small.masks, small.cameras, views.bounds, side, votes=max(1, round(VOTES * len(views))))
-        grid[0] = torch.where(hull.occupied, INSIDE, OUTSIDE)
+        grid[0] = torch.where(hull.occupied, INITIAL_INSIDE, INITIAL_OUTSIDE)
     return grid

@@ -19,7 +19,7 @@ from hyperplanes.utilities.files.writing import write_json, write_whole
 
 __all__ = ["Captured", "straightened", "write_scene"]
 
-POINTS = "sparse_pc.ply"
+POINT_CLOUD_FILE = "sparse_pc.ply"
 STRAIGHT = 0.25  # pixels: images whose corners the distortion moves less than this are not undistorted
 
 
@@ -99,7 +99,7 @@ def write_scene(
             (folder / name).unlink()
     for name, data in files.items():
         write_whole(folder / name, data, durable=False)
-    write_whole(folder / POINTS, encode_ply(model.points, model.colours), durable=False)
+    write_whole(folder / POINT_CLOUD_FILE, encode_ply(model.points, model.colours), durable=False)
     world_from_camera = np.linalg.inv(model.camera_from_world)
     paths = [f"images/{name}.jpg" for name in names]
     document = transforms_document(
@@ -110,7 +110,7 @@ def write_scene(
             frame["h"], frame["w"] = size
         if f"masks/{name}.png" in files:
             frame["mask_path"] = f"masks/{name}.png"
-    write_json(folder / "transforms.json", document | {"up": "z", "ply_file_path": POINTS})
+    write_json(folder / "transforms.json", document | {"up": "z", "ply_file_path": POINT_CLOUD_FILE})
     return Captured(folder, len(names), len(model.points), model.reprojection_error)
 
 

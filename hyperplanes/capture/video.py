@@ -16,10 +16,10 @@ from hyperplanes.utilities.files.writing import write_whole
 
 __all__ = ["sharpness", "take_frames"]
 
-LOOKED_AT = 5  # frames of each interval, of which the sharpest is taken
-QUALITY = 95  # of JPEG
-SMALL = 320  # pixels along the longer side, at which sharpness is measured
-BLURRED = 0.25  # of the median sharpness: frames with less are left out
+FRAMES_PER_INTERVAL = 5  # frames of each interval, of which the sharpest is taken
+JPEG_QUALITY = 95  # of JPEG
+SHARPNESS_SIZE = 320  # pixels along the longer side, at which sharpness is measured
+MIN_RELATIVE_SHARPNESS = 0.25  # of the median sharpness: frames with less are left out
 
 
 def take_frames(path: Path, folder: Path, count: int, progress: Callable[[str, int, int, str], None]) -> int:
@@ -48,7 +48,7 @@ def take_frames(path: Path, folder: Path, count: int, progress: Callable[[str, i
     if total < 3 or not count >= 3:
         frames.close()
         raise DataError(path, "a video of some seconds", f"{total} frames", "film once around the object")
-    wanted = {round(index) for index in np.linspace(0, total - 1, min(total, count * LOOKED_AT))}
+    wanted = {round(index) for index in np.linspace(0, total - 1, min(total, count * FRAMES_PER_INTERVAL))}
     stretch = total / min(count, total)
     best: dict[int, tuple[float, bytes]] = {}
     for index, picture in enumerate(_pictures(frames, about["size"])):
@@ -57,10 +57,10 @@ def take_frames(path: Path, folder: Path, count: int, progress: Callable[[str, i
         progress("frames", min(index, total), total, path.name)
         slot, value = int(index / stretch), sharpness(picture)
         if slot not in best or value > best[slot][0]:
-            best[slot] = value, encode_jpeg(picture, QUALITY)
+            best[slot] = value, encode_jpeg(picture, JPEG_QUALITY)
     if not best:
         raise DataError(path, "a video with frames that can be read", "none", "export it again")
-    least = BLURRED * float(np.median([value for value, _ in best.values()]))
+    least = MIN_RELATIVE_SHARPNESS * float(np.median([value for value, _ in best.values()]))
     kept = [data for _, (value, data) in sorted(best.items()) if value >= least]
     for index, data in enumerate(kept):
         write_whole(folder / f"frame_{index:04d}.jpg", data, durable=False)
@@ -75,7 +75,7 @@ def sharpness(picture: np.ndarray) -> float:
         picture: (height, width, 3), 8 bits.
     """
     small = Image.fromarray(picture).convert("L")
-    small.thumbnail((SMALL, SMALL))
+    small.thumbnail((SHARPNESS_SIZE, SHARPNESS_SIZE))
     return float(ndimage.laplace(np.asarray(small, np.float64)).var())
 
 

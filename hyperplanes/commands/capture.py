@@ -59,13 +59,13 @@ class Arguments:
 def run(arguments: Arguments) -> int:
     """Find poses and masks, write the scene, and print what was found and what was left out."""
     from hyperplanes.capture import Settings, capture
-    from hyperplanes.capture.pipeline import FRAMES
+    from hyperplanes.capture.pipeline import VIDEO_FRAMES
 
     console, started = Console(), time.perf_counter()
     if arguments.frames is not None and arguments.photographs.is_dir():
         found = f"the folder {arguments.photographs}, whose photographs are all used"
         raise ValueError(f"--frames: expected a video, got {found}; leave it out")
-    settings = Settings(arguments.size, arguments.mask, arguments.frames or FRAMES, arguments.order)
+    settings = Settings(arguments.size, arguments.mask, arguments.frames or VIDEO_FRAMES, arguments.order)
     with ExitStack() as stack:
         shown: tuple[str, Bar] | None = None
 

@@ -323,13 +323,13 @@ def _show(arguments: Arguments, scores: Sequence[Score], pairs: Sequence[Compari
 
 def _tasks(arguments: Arguments, opened: Dataset, seed: int) -> Tasks:
     """The objects with the requested support and query views."""
-    from hyperplanes.data.support import FewerQueries, Inputs, WithSupport
+    from hyperplanes.data.support import FewerQueries, SupportByPosition, WithSupport
     from hyperplanes.utilities.messages.errors import rename_errors
 
     tasks: Tasks = opened
     if arguments.inputs:
         with rename_errors("inputs", "--inputs"):
-            tasks = Inputs(opened, arguments.inputs)
+            tasks = SupportByPosition(opened, arguments.inputs)
     elif arguments.support is not None:
         tasks = WithSupport(opened, arguments.support, arguments.choose, seed)
     return tasks if arguments.query is None else FewerQueries(tasks, arguments.query)

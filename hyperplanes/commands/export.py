@@ -230,9 +230,8 @@ def _write_points(field: AdaptedField | BakedScene, shown: Views, arguments: Arg
 def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Arguments, console: Console) -> None:
     """Write the splats of baked voxels, and print the PSNR of both."""
     from hyperplanes.export.baking import BakedScene
-    from hyperplanes.export.splats import STEPS, fit_splats, save_splats, splats_of
-    from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
-    from hyperplanes.export.voxel_fitting import render_guide
+    from hyperplanes.export.splats import SPLAT_STEPS, fit_splats, save_splats, splats_of
+    from hyperplanes.export.voxel_fitting import VOXEL_STEPS, render_guide
     from hyperplanes.geometry.distortion import DistortedCamera
     from hyperplanes.utilities.images.metrics import psnr
 
@@ -240,7 +239,7 @@ def _write_splats(baked: BakedField, shown: Views, query: Views, arguments: Argu
     straight = not isinstance(shown.cameras, DistortedCamera)
     if straight and arguments.fit:
         with console.bar("fitting splats") as bar:
-            steps = arguments.fit * STEPS // VOXEL_STEPS
+            steps = arguments.fit * SPLAT_STEPS // VOXEL_STEPS
             guide = render_guide(BakedScene(baked), shown, size=shown.size)
             splats = fit_splats(
                 splats, shown, guide=guide, steps=steps, on_step=lambda done: bar.show(done, steps, "steps")

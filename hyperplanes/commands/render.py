@@ -177,7 +177,7 @@ def _drawn(
     """The field, or its voxels, with residuals if requested, and whether there are residuals."""
     from hyperplanes.adaptation.correction.residuals import CorrectedField, ResidualField
     from hyperplanes.export.animation import choose_representation
-    from hyperplanes.export.voxel_fitting import STEPS as VOXEL_STEPS
+    from hyperplanes.export.voxel_fitting import VOXEL_STEPS
 
     make = partial(bake_field, fit=VOXEL_STEPS, console=console)
     field = choose_representation(field, shown, asked.cameras, _representation(arguments, asked), make=make)

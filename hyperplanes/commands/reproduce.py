@@ -103,7 +103,7 @@ def run(arguments: Arguments) -> int:
     from hyperplanes.experiments import SCALES, find_experiment, report
     from hyperplanes.experiments.configurations import DIFFERENCE_HEADINGS
     from hyperplanes.experiments.estimate import estimate
-    from hyperplanes.experiments.paper.tables import CLASSES
+    from hyperplanes.experiments.paper.tables import CLASS_OF_COLUMN
     from hyperplanes.experiments.workspace import Workspace
     from hyperplanes.utilities.messages.formatting import format_duration
 
@@ -120,7 +120,7 @@ def run(arguments: Arguments) -> int:
     def found(cell: Cell, seed: int, score: ObjectScore, *_: int) -> None:
         console.say(f"{cell.row}, {cell.column}, seed {seed}: {score.name} {score.psnr:.2f} dB")
 
-    given = data_sets(arguments.data, dict.fromkeys([*CLASSES.values(), *table.classes]))
+    given = data_sets(arguments.data, dict.fromkeys([*CLASS_OF_COLUMN.values(), *table.classes]))
     device, legacy = arguments.device, arguments.legacy
     workers = make_workers(arguments.workers, arguments.out, scale, device, given=given, legacy=legacy)
     runner = make_runner(

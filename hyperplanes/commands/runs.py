@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 __all__ = ["count_workers", "make_runner", "make_workers"]
 
-MOST = 4
+MAX_DEFAULT_WORKERS = 4
 """Most workers by default, because each holds the data set that it trains on in memory."""
 
 
 def count_workers(asked: int | None, device: str) -> int:
-    """The requested number of workers; by default one per core, at most MOST, and a single one on a GPU.
+    """The requested number of workers; by default one per core, at most MAX_DEFAULT_WORKERS, and a single one on a GPU.
 
     Raises:
         ValueError: less than one worker.
@@ -36,7 +36,7 @@ def count_workers(asked: int | None, device: str) -> int:
         if asked < 1:
             raise ValueError(f"--workers: expected at least 1, got {asked}")
         return asked
-    return min(MOST, usable_cores()) if choose_device(device).type == "cpu" else 1
+    return min(MAX_DEFAULT_WORKERS, usable_cores()) if choose_device(device).type == "cpu" else 1
 
 
 def make_workers(count: int, out: Path, scale: Scale, device: str, **given: Any) -> Workers | None:

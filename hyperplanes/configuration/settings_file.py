@@ -30,7 +30,7 @@ from hyperplanes.utilities.messages.errors import nearest
 __all__ = ["changed", "document", "parse_options", "read_experiment", "write_experiment"]
 
 ENTRIES = {"preset": str, "method": str, "model": dict, "training": dict}
-LARGEST = 2**20  # bytes of a file
+MAX_SETTINGS_BYTES = 2**20  # bytes of a file
 
 
 class _Loader(yaml.SafeLoader):
@@ -69,7 +69,7 @@ def read_experiment(path: Path) -> dict[str, Any]:
     """
     remedy = "`hyperplanes presets quick` prints a whole one"
     try:
-        text = read_bytes(path, LARGEST)
+        text = read_bytes(path, MAX_SETTINGS_BYTES)
     except DataError:
         raise
     except OSError as error:

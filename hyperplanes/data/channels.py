@@ -12,9 +12,9 @@ from hyperplanes.data.formats.arrays import read_arrays
 from hyperplanes.utilities.files.reading import DataError
 from hyperplanes.utilities.messages.arguments import checked
 
-__all__ = ["CHANNELS", "mesh_path", "read_channel"]
+__all__ = ["CHANNEL_DIMENSIONS", "mesh_path", "read_channel"]
 
-CHANNELS = {"depth": 3, "normals": 4, "coordinates": 4}
+CHANNEL_DIMENSIONS = {"depth": 3, "normals": 4, "coordinates": 4}
 """The channels, and the number of dimensions of each."""
 
 _REMEDY = "generate the data set with this channel"
@@ -30,7 +30,7 @@ def read_channel(folder: str | Path, channel: str) -> Tensor:
 
     Args:
         folder: of the object.
-        channel: a key of CHANNELS.
+        channel: a key of CHANNEL_DIMENSIONS.
 
     Returns:
         The values, exactly as they were rendered.
@@ -39,15 +39,15 @@ def read_channel(folder: str | Path, channel: str) -> Tensor:
         ValueError: an unknown channel.
         DataError: the object was generated without this channel, or the file is malformed.
     """
-    if channel not in CHANNELS:
-        raise ValueError(f"channel: expected one of {', '.join(CHANNELS)}, got {channel!r}")
+    if channel not in CHANNEL_DIMENSIONS:
+        raise ValueError(f"channel: expected one of {', '.join(CHANNEL_DIMENSIONS)}, got {channel!r}")
     path = Path(folder) / f"{channel}.npz"
     if not path.is_file():
         raise DataError(path, f"the {channel} of the object", "nothing", _REMEDY)
     values = read_arrays(path, {channel}).get(channel)
-    if values is None or values.ndim != CHANNELS[channel] or values.dtype != np.float32:
+    if values is None or values.ndim != CHANNEL_DIMENSIONS[channel] or values.dtype != np.float32:
         found = "another array" if values is None else f"{values.dtype} {values.shape}"
-        raise DataError(path, f"a float32 array {channel} of {CHANNELS[channel]} dimensions", found, _REMEDY)
+        raise DataError(path, f"a float32 array {channel} of {CHANNEL_DIMENSIONS[channel]} dimensions", found, _REMEDY)
     return torch.from_numpy(values)
 
 

@@ -16,7 +16,7 @@ from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.files.order import natural_order
 from hyperplanes.views import Task, join_views
 
-__all__ = ["Choice", "FewerQueries", "Inputs", "Shown", "SingleView", "WithBounds", "WithSupport"]
+__all__ = ["Choice", "FarthestSupport", "FewerQueries", "SingleView", "SupportByPosition", "WithBounds", "WithSupport"]
 
 Choice = Literal["first", "farthest", "random"]
 
@@ -123,7 +123,7 @@ class FewerQueries(TaskWrapper):
 
 
 @dataclass(frozen=True)
-class Shown(TaskWrapper):
+class FarthestSupport(TaskWrapper):
     """Tasks whose support views are those farthest apart, and whose query views are some of the original ones.
 
     Attributes:
@@ -145,7 +145,7 @@ class Shown(TaskWrapper):
 
 
 @dataclass(frozen=True)
-class Inputs(TaskWrapper):
+class SupportByPosition(TaskWrapper):
     """Tasks whose support views have given positions in the order of view names; all other views are query views.
 
     Numbers in names are sorted as numbers, so that r_2 comes before r_10.

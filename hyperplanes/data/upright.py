@@ -22,7 +22,7 @@ __all__ = ["UPS", "guess_up", "stated_up", "upright", "upright_cameras", "uprigh
 UPS = ("y", "z", "x", "-y", "-z", "-x")
 """Axes that may point up in a world. Another direction is written as three numbers with commas between them."""
 
-LEVEL = 0.1  # largest root mean square, over the cameras, of the sine of their roll for them to count as level
+MAX_ROLL = 0.1  # largest root mean square, over the cameras, of the sine of their roll for them to count as level
 
 
 def guess_up(cameras: PinholeCamera) -> str | None:
@@ -42,13 +42,13 @@ def guess_up(cameras: PinholeCamera) -> str | None:
     found = {}
     for name in UPS:
         axis = _direction(name)
-        if float((right @ axis).square().mean().sqrt()) < LEVEL and float(upward @ axis) > LEVEL:
+        if float((right @ axis).square().mean().sqrt()) < MAX_ROLL and float(upward @ axis) > MAX_ROLL:
             found[name] = float(upward @ axis)
     if found:
         return max(found, key=lambda name: found[name])
     values, vectors = torch.linalg.eigh(right.T @ right / len(right))
     axis = vectors[:, 0] * torch.sign(upward @ vectors[:, 0])
-    if values[0].clamp_min(0).sqrt() > LEVEL or values[1] < 4 * LEVEL**2 or float(upward @ axis) <= LEVEL:
+    if values[0].clamp_min(0).sqrt() > MAX_ROLL or values[1] < 4 * MAX_ROLL**2 or float(upward @ axis) <= MAX_ROLL:
         return None
     return ",".join(f"{value:.4f}" for value in axis.tolist())
 

@@ -31,7 +31,7 @@ CONVOLUTIONS = (
     ("net.slice5.10", 256, 256, 3, 1, 1, False),
 )
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of RGB in [-1, 1], as in the package
-SMALLEST = 32  # pixels along a side: the first convolution has stride 4, and two poolings follow
+MIN_IMAGE_SIZE = 32  # pixels along a side: the first convolution has stride 4, and two poolings follow
 
 
 class LPIPS:
@@ -64,8 +64,8 @@ class LPIPS:
         Raises:
             ValueError: pictures smaller than 32 x 32 pixels.
         """
-        if min(truth.shape[2:]) < SMALLEST:
-            expected = f"at least {SMALLEST} x {SMALLEST} pixels for LPIPS"
+        if min(truth.shape[2:]) < MIN_IMAGE_SIZE:
+            expected = f"at least {MIN_IMAGE_SIZE} x {MIN_IMAGE_SIZE} pixels for LPIPS"
             raise ValueError(f"images: expected {expected}, got {truth.shape[2]} x {truth.shape[3]}")
         first, second = self._scaled(predicted), self._scaled(truth)
         total = torch.zeros(len(truth), device=first.device)

@@ -14,11 +14,12 @@ from hyperplanes.views import Views
 
 __all__ = ["FEWEST_VIEWS", "held_out_psnr", "suitability_warnings", "worse_than_copying"]
 
-COVERED = 0.95  # mean opacity above which masks are as good as no masks
-UNLIKE = 3.0  # standardised codes, root mean square: 0.7 to 2 for held-out objects of a trained class, others 3.3 to 8
+MAX_MASK_COVERAGE = 0.95  # mean opacity above which masks are as good as no masks
+# standardised codes, root mean square: 0.7 to 2 for held-out objects of a trained class, others 3.3 to 8
+MAX_CODE_DISTANCE = 3.0
 ELSEWHERE = 30.0  # mean degrees between the directions of cameras and of the planes that they fill, above which to warn
 FEWEST_VIEWS = 4  # of which some are held out
-HELD_OUT = 4  # most held-out views, and pixels along their longer side
+MAX_HELD_OUT = 4  # most held-out views, and pixels along their longer side
 HELD_OUT_SIZE = 64
 SHOWN_SIZE = 4 * HELD_OUT_SIZE
 
@@ -33,7 +34,7 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
     """
     found = []
     covered = _covered(shown)
-    if covered > COVERED:
+    if covered > MAX_MASK_COVERAGE:
         what = "no alpha and no masks" if shown.masks is None else f"masks that cover {covered:.0%}"
         found.append(
             f"the views have {what}, but the model was trained on objects over white, so it would treat the background "
@@ -44,7 +45,7 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
         stated = f"{len(shown)} support views are given and the model was trained with {planes}"
         found.append(f"{stated}: some views fill several planes")
     unlike, angle = _unlikeness(model, shown)
-    if unlike is not None and unlike > UNLIKE:
+    if unlike is not None and unlike > MAX_CODE_DISTANCE:
         found.append(
             f"the images differ from those of the training, {unlike:.1f} times as much as those among each other"
             + ("" if steps or len(shown) < 2 else "; --steps 100 adapts to them")
@@ -75,7 +76,7 @@ def worse_than_copying(shown: Views, rendered: float, copied: float, steps: obje
     advice = "`hyperplanes inspect` checks images, masks and poses"
     if steps == 0 and len(shown) > 1:
         advice += ", and --steps 100 adapts the model to the views"
-    advice = "cut the object out first" if _covered(shown) > COVERED else advice
+    advice = "cut the object out first" if _covered(shown) > MAX_MASK_COVERAGE else advice
     return [f"worse than copying the nearest view: {rendered:.2f} dB against {copied:.2f} dB; {advice}"]
 
 
@@ -94,7 +95,7 @@ def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | Non
     """
     if len(shown) < FEWEST_VIEWS:
         return None
-    holdout = torch.linspace(0, len(shown) - 1, min(HELD_OUT, len(shown) // 2) + 2)[1:-1].round().long()
+    holdout = torch.linspace(0, len(shown) - 1, min(MAX_HELD_OUT, len(shown) // 2) + 2)[1:-1].round().long()
     rest = [index for index in range(len(shown)) if index not in holdout.tolist()]
     shown = shown.resized(SHOWN_SIZE)
     left_out, remaining = shown[holdout].resized(HELD_OUT_SIZE), shown[rest]

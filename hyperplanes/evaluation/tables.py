@@ -14,13 +14,19 @@ __all__ = ["PAIR_HEADINGS", "as_csv", "as_json", "as_markdown", "compared_rows",
 PAIR_HEADINGS = ("paired over objects, PSNR", "difference", "95 % interval", "p")
 """The headings of `compared_rows`."""
 
-COLUMNS = {"psnr": "PSNR", "psnr_foreground": "inside mask", "psnr_pooled": "pooled", "ssim": "SSIM", "lpips": "LPIPS"}
+METRIC_LABELS = {
+    "psnr": "PSNR",
+    "psnr_foreground": "inside mask",
+    "psnr_pooled": "pooled",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+}
 
 
 def headings(scores: Sequence[Score]) -> list[str]:
     """The headings of `rows`, for the numbers that every method has."""
     found = ["method", "PSNR", "over objects"]
-    found += [label for name, label in COLUMNS.items() if name != "psnr" and _all_have(scores, name)]
+    found += [label for name, label in METRIC_LABELS.items() if name != "psnr" and _all_have(scores, name)]
     return [*found, "to adapt", "to render a view"]
 
 
@@ -33,7 +39,7 @@ def rows(scores: Sequence[Score]) -> list[tuple[str, ...]]:
     for score in scores:
         spread = score.spread("psnr")
         row = [score.method, _shown(score, "psnr"), "-" if spread is None else f"± {spread:.2f} dB"]
-        row += [_shown(score, name) for name in COLUMNS if name != "psnr" and _all_have(scores, name)]
+        row += [_shown(score, name) for name in METRIC_LABELS if name != "psnr" and _all_have(scores, name)]
         row += [format_duration(score.mean(name)) for name in ("adapt_seconds", "render_seconds")]
         table.append(tuple(row))
     return table

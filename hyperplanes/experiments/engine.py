@@ -16,7 +16,7 @@ from hyperplanes.adaptation.base import Pictures, Renderable
 from hyperplanes.adaptation.checkpoints import find_checkpoints
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.configuration.initialisation import LEARNED
-from hyperplanes.data.support import Shown, WithSupport
+from hyperplanes.data.support import FarthestSupport, WithSupport
 from hyperplanes.evaluation import ObjectScore, Score, evaluate, merge_seeds
 from hyperplanes.experiments.configurations import scaled_preset
 from hyperplanes.experiments.data_sets import DataSets
@@ -278,7 +278,7 @@ class Runner:
         trainable = cell.trainable if "hyperplanes" in checkpoints else "weights"
         settings = replace(self.fine_tuning(cell), trainable=trainable, seed=seed)
         tasks, views = self.data.tasks(cell.on), self._views(cell, checkpoint)
-        tasks = WithSupport(tasks, views) if cell.query is None else Shown(tasks, views, cell.query)
+        tasks = WithSupport(tasks, views) if cell.query is None else FarthestSupport(tasks, views, cell.query)
         names = self.data.evaluated(cell.on, cell.split, experiment.objects)
         request = Request(
             method,

@@ -18,8 +18,8 @@ from hyperplanes.utilities.messages.formatting import format_duration, format_ra
 
 __all__ = ["Estimate", "estimate"]
 
-STEPS = 2  # measured steps, after one that is not measured
-SIDE = 32  # pixels along a side of the view that is rendered
+MEASURED_STEPS = 2  # measured steps, after one that is not measured
+MEASURED_VIEW_SIZE = 32  # pixels along a side of the view that is rendered
 
 
 @dataclass(frozen=True)
@@ -95,16 +95,16 @@ def _measure(runner: Runner, experiment: Experiment, trained: Trained) -> _Measu
     trainer.loader.names = trainer.loader.names[: trainer.config.tasks]  # the first step prepares all of these
     trainer.take_step()
     started = clock()
-    for _ in range(STEPS):
+    for _ in range(MEASURED_STEPS):
         trainer.take_step()
-    step = (clock() - started) / STEPS
+    step = (clock() - started) / MEASURED_STEPS
     task = trainer.data.task(trainer.loader.names[0])
     field = trainer.model.adapt(task.support)
-    view = camera.resized(camera.select(task.query.cameras, [0]), SIDE, SIDE)
+    view = camera.resized(camera.select(task.query.cameras, [0]), MEASURED_VIEW_SIZE, MEASURED_VIEW_SIZE)
     field.render(view)  # the first call finds the occupied voxels, once per object
     started = clock()
     field.render(view)
-    return _Measured(step, (clock() - started) / SIDE**2, trainer.objective.rays_per_step / step)
+    return _Measured(step, (clock() - started) / MEASURED_VIEW_SIZE**2, trainer.objective.rays_per_step / step)
 
 
 def _trainer(runner: Runner, experiment: Experiment, trained: Trained) -> Trainer:

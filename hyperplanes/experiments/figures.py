@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["curves_of", "figure_of", "pictures_of"]
 
-AXES = {"psnr": "PSNR (dB)", "ssim": "SSIM", "image_seconds": "seconds a view"}
+AXIS_LABELS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "image_seconds": "seconds a view"}
 
 
 def figure_of(outcome: Outcome) -> Figure:
@@ -48,14 +48,14 @@ def _bars(outcome: Outcome) -> Figure:
         spread = None if any(each is None for _, each in found) else [float(each or 0.0) for _, each in found]
         ours[column] = ([number for number, _ in found], spread)
     draw_bars(parts[0], experiment.rows, ours)
-    parts[0].set(ylabel=AXES[experiment.cells[0].quantity], title="here")
+    parts[0].set(ylabel=AXIS_LABELS[experiment.cells[0].quantity], title="here")
     if published is not None:
         theirs = {
             column: ([experiment.published_value(row, column) or math.nan for row in experiment.rows], None)
             for column in experiment.columns
         }
         draw_bars(parts[1], experiment.rows, theirs)
-        parts[1].set(ylabel=AXES[experiment.cells[0].quantity], title=f"paper, {published.label}")
+        parts[1].set(ylabel=AXIS_LABELS[experiment.cells[0].quantity], title=f"paper, {published.label}")
         parts[1].get_legend().remove()
     many = len(experiment.rows)
     parts[-1].tick_params(axis="x", labelrotation=60 if many > 9 else 20 if many > 4 else 0)

@@ -9,7 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from hyperplanes.adaptation.base import AdaptedField, Renderable
 from hyperplanes.export.baking import BakedScene, bake, default_side
-from hyperplanes.export.voxel_fitting import ENOUGH, STEPS, fit_voxels, render_guide
+from hyperplanes.export.voxel_fitting import MIN_UNGUIDED_VIEWS, VOXEL_STEPS, fit_voxels, render_guide
 from hyperplanes.fields.baked import BakedField
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.views import Views
@@ -18,7 +18,7 @@ __all__ = ["Representation", "choose_representation", "draws_by_voxels", "fitted
 
 Representation: TypeAlias = Literal["auto", "field", "voxels"]
 
-PIXELS = 24
+PIXELS_PER_VOXEL_FACE = 24
 """Pixels of all pictures for each voxel of a face of the grid, from which on baking, fitting and rendering voxels takes
 less time than rendering the field, on two cores."""
 
@@ -40,10 +40,10 @@ def draws_by_voxels(views: int, cameras: PinholeCamera, side: int) -> bool:
         side: voxels an axis.
     """
     height, width = camera.image_size(cameras)
-    return views >= ENOUGH and cameras.batch_size * height * width >= PIXELS * side**2
+    return views >= MIN_UNGUIDED_VIEWS and cameras.batch_size * height * width >= PIXELS_PER_VOXEL_FACE * side**2
 
 
-def fitted_voxels(adapted: AdaptedField, views: Views, side: int, *, steps: int = STEPS) -> BakedField:
+def fitted_voxels(adapted: AdaptedField, views: Views, side: int, *, steps: int = VOXEL_STEPS) -> BakedField:
     """The voxels of a field, fitted to its support views.
 
     Args:

@@ -24,17 +24,18 @@ from hyperplanes.rendering.images import join_pictures, render_images
 from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.rendering.scene import SplitField
 from hyperplanes.rendering.transmittance import transmittance
-from hyperplanes.rendering.voxels import STOP, VoxelGrid, render_voxels, shade_voxels
+from hyperplanes.rendering.voxels import STOP_TRANSMITTANCE, VoxelGrid, render_voxels, shade_voxels
 from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["BakedScene", "bake", "coarsening", "default_side"]
 
-CHUNK = 1 << 12
-DIRECTIONS = 12  # from which colour is evaluated; at least one a harmonic
-SIDE = 128  # voxels an axis of the grid of transmittances
+BAKING_CHUNK = 1 << 12
+COLOUR_DIRECTIONS = 12  # from which colour is evaluated; at least one a harmonic
+TRANSMITTANCE_SIDE = 128  # voxels an axis of the grid of transmittances
 MIN_TRANSMITTANCE = 0.02  # voxels that no viewing direction reaches with more than this are left out
-MIN_OPACITY = 0.005  # over 1/128 of the scene's diameter; voxels below it are left out
-EDGE = 0.5  # as in `render_images`; voxels are cheap enough for extra rays in more pixels, which bring 0.1 dB
+MIN_VOXEL_OPACITY = 0.005  # over 1/128 of the scene's diameter; voxels below it are left out
+# as in `render_images`; voxels are cheap enough for extra rays in more pixels, which bring 0.1 dB
+BAKED_EDGE_THRESHOLD = 0.5
 MIN_WEIGHT = 0.01  # of a voxel in the pixel that sees it best; voxels below it are left out
 
 
@@ -66,14 +67,16 @@ class BakedScene:
             def render_rays(rays: Rays) -> Rendered:
                 return render_voxels(self.grid, shaded, rays, step=step)
 
-            return render_images(one, bounds, render_rays, occupancy=self._coarse_occupancy, antialias=True, edge=EDGE)
+            return render_images(
+                one, bounds, render_rays, occupancy=self._coarse_occupancy, antialias=True, edge=BAKED_EDGE_THRESHOLD
+            )
 
         return join_pictures([view(place) for place in range(cameras.batch_size)])
 
     @cached_property
     def adapted(self) -> AdaptedField:
         """The voxels as an `AdaptedField`."""
-        return AdaptedField(self.field, self.field.occupancy, RayMarching(self.steps, STOP))
+        return AdaptedField(self.field, self.field.occupancy, RayMarching(self.steps, STOP_TRANSMITTANCE))
 
     @cached_property
     def grid(self) -> VoxelGrid:
@@ -115,11 +118,11 @@ def bake(adapted: AdaptedField, *, side: int = 256, on_part: Callable[[int, int]
         ValueError: a field that is empty everywhere.
     """
     coarser = coarsening(side)
-    view = camera.fibonacci_sphere(DIRECTIONS, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
+    view = camera.fibonacci_sphere(COLOUR_DIRECTIONS, 1.0)[:, 2, :3].to(adapted.occupancy.occupied.device)
     # transmittance from outside to coarse voxels, along every direction
     coarse = _in_sphere(_resampled(adapted.refined_occupancy, side // coarser))
     optical_depth = torch.zeros_like(coarse.occupied, dtype=view.dtype)
-    density = torch.cat([adapted.density(part) for part in coarse.centres().split(CHUNK)])
+    density = torch.cat([adapted.density(part) for part in coarse.centres().split(BAKING_CHUNK)])
     optical_depth[coarse.occupied] = density * coarse.voxel
     arriving = transmittance(optical_depth, coarse.occupied.nonzero(), view)
     # voxels that are visible from some direction
@@ -136,11 +139,11 @@ def bake(adapted: AdaptedField, *, side: int = 256, on_part: Callable[[int, int]
 
     cells, rows, centres = [], [], fine.centres()
     parallel = adapted.thread_safe and centres.device.type == "cpu"
-    for cell, found in (parallel_map if parallel else map)(voxels, centres.split(CHUNK)):
+    for cell, found in (parallel_map if parallel else map)(voxels, centres.split(BAKING_CHUNK)):
         cells.append(cell)
         rows.append(found)
         if on_part:
-            on_part(min(len(cells) * CHUNK, len(centres)), len(centres))
+            on_part(min(len(cells) * BAKING_CHUNK, len(centres)), len(centres))
     if not sum(len(part) for part in cells):
         raise ValueError("bake: expected a field with something in it, got one that is empty everywhere")
     filled, values = torch.cat(cells), torch.cat(rows)
@@ -159,7 +162,7 @@ def coarsening(side: int) -> int:
     Raises:
         ValueError: too few, too many, or not a multiple of that number.
     """
-    coarser = max(2, side // SIDE)
+    coarser = max(2, side // TRANSMITTANCE_SIDE)
     if side % coarser or not 8 <= side <= LARGEST_SIDE:
         raise ValueError(f"side: expected a multiple of {coarser} from 8 to {LARGEST_SIDE}, got {side}")
     return coarser
@@ -186,7 +189,7 @@ def _voxels(
     length = adapted.occupancy.bounds.radius / 64
     hidden = field.hidden(points) if isinstance(field, SplitField) else points
     density = field.density_of(hidden) if isinstance(field, SplitField) else adapted.density(points)
-    some = 1 - torch.exp(-density * length) > MIN_OPACITY
+    some = 1 - torch.exp(-density * length) > MIN_VOXEL_OPACITY
     some &= arriving.amax(1) * (1 - torch.exp(-density * voxel)) > MIN_WEIGHT
     hidden, density, arriving = hidden[some], density[some], arriving[some]
     if isinstance(field, MLPField):

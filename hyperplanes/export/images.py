@@ -45,7 +45,8 @@ __all__ = [
 ]
 
 TURNTABLE_FORMATS = ("webp", "gif", "mp4", "webm")
-FRAMED, MARGIN = 48, 0.02  # voxels an axis of the hull that must fit into an orbit's pictures; free share of a side
+FRAMING_HULL_SIDE = 48  # voxels an axis of the hull that must fit into an orbit's pictures
+FRAMING_MARGIN = 0.02  # free share of a side
 CODECS = {
     "mp4": {"codec": "libx264", "quality": 8},
     # same quality (44.3 and 44.5 dB on the views of example-car); this encoder ignores imageio-ffmpeg's quality
@@ -255,7 +256,7 @@ def _stepped_back(pose: Tensor, lens: PinholeCamera, views: Views) -> Tensor:
     """Poses (camera from world) moved back by one distance, so that the visual hull fits into the pictures."""
     if views.masks is None or isinstance(views.cameras, DistortedCamera):
         return pose
-    hull = carve(views.masks, views.cameras, views.bounds, FRAMED)
+    hull = carve(views.masks, views.cameras, views.bounds, FRAMING_HULL_SIDE)
     points = hull.centres().to(pose)
     if not len(points):
         return pose
@@ -263,7 +264,7 @@ def _stepped_back(pose: Tensor, lens: PinholeCamera, views: Views) -> Tensor:
     seen = points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
     needed = seen.new_zeros(())
     for axis, side in ((0, width), (1, height)):
-        focal, middle, margin = matrix[axis, axis], matrix[axis, 2], MARGIN * side
+        focal, middle, margin = matrix[axis, axis], matrix[axis, 2], FRAMING_MARGIN * side
         before, after = middle - margin, side - 1 - margin - middle  # pixels to both borders
         for place, room in ((-seen[..., axis], before), (seen[..., axis], after)):
             if room > 0:

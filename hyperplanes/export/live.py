@@ -30,8 +30,8 @@ LOG = logging.getLogger(__name__)
 SECONDS = 0.15  # largest rendering time of a picture while the camera moves
 IDLE = 0.4  # seconds without motion after which a larger picture is rendered
 SHARPER = 2.5  # times as large
-SMALLEST, LARGEST = 48, 1024  # pixels of height
-WIDEST = 4096  # pixels of width
+MIN_HEIGHT, MAX_HEIGHT = 48, 1024  # pixels of height
+MAX_WIDTH = 4096  # pixels of width
 THUMBNAIL = 128  # pixels of a photograph in its frustum
 ALONE = "nothing"  # the default choice for what is shown beside the field
 
@@ -64,18 +64,18 @@ def viewed_camera(
         position: in the world.
         fov: vertical field of view in radians.
         aspect: width over height.
-        height: pixels; reduced where the width would exceed WIDEST.
+        height: pixels; reduced where the width would exceed MAX_WIDTH.
 
     Raises:
         ValueError: impossible values, as browsers send them for a page without a size.
     """
     if not _has_size(fov, aspect):
         raise ValueError(f"camera: expected an aspect above 0 and an angle below 180 degrees, got {aspect}, {fov}")
-    height = max(1, min(height, round(WIDEST / aspect)))
+    height = max(1, min(height, round(MAX_WIDTH / aspect)))
     pose = torch.eye(4)
     pose[:3, :3] = quaternion_to_rotation_matrix(torch.tensor([float(part) for part in rotation])).T
     pose[:3, 3] = -pose[:3, :3] @ torch.tensor([float(part) for part in position])
-    width = max(1, min(WIDEST, round(height * aspect)))
+    width = max(1, min(MAX_WIDTH, round(height * aspect)))
     focal = height / 2 / math.tan(fov / 2)
     intrinsics = torch.tensor([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
     return camera.pinhole(intrinsics, pose[None], height, width)
@@ -307,7 +307,7 @@ class LiveViewer:
             other: what to render on the right half, if anything.
             still: whether the camera stands still, so that rendering may take longer.
         """
-        height = min(LARGEST, round(self._height * (SHARPER if still else 1)))
+        height = min(MAX_HEIGHT, round(self._height * (SHARPER if still else 1)))
         eye = client.camera  # pyright: ignore
         if not _has_size(eye.fov, eye.aspect):
             return False
@@ -317,7 +317,7 @@ class LiveViewer:
         picture = to_pixels(found.images if other is None else beside(found, other.render(seen)))[0]
         if not still:
             ratio = (SECONDS / max(1e-3, time.perf_counter() - started)) ** 0.5
-            self._height = round(min(LARGEST / SHARPER, max(SMALLEST, self._height * min(1.5, max(0.5, ratio)))))
+            self._height = round(min(MAX_HEIGHT / SHARPER, max(MIN_HEIGHT, self._height * min(1.5, max(0.5, ratio)))))
         # lossless when it stands still: JPEG artefacts would be mistaken for the field's
         client.scene.set_background_image(picture, "png" if still else "jpeg", jpeg_quality=90)  # pyright: ignore
         return True

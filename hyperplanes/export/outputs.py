@@ -21,7 +21,7 @@ __all__ = ["OUTPUTS", "depth_pixels", "output_frames", "save_outputs"]
 OUTPUTS = ("rgb", "depth", "normals", "accumulation")
 """The outputs."""
 
-NEAREST, FARTHEST = 2**14, 2**16 - 1
+NEAREST_VALUE, FARTHEST_VALUE = 2**14, 2**16 - 1
 """Pixel values of depth; the nearest is a quarter of white, distinct from 0 for empty pixels."""
 
 
@@ -43,7 +43,11 @@ def depth_pixels(z: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint16], fl
         return np.zeros(z.shape, np.uint16), 0.0, 0.0
     nearest, farthest = float(z[seen].min()), float(z[seen].max())
     scaled = (z.astype(np.float64) - nearest) / (farthest - nearest or 1.0)
-    return np.where(seen, NEAREST + np.round(scaled * (FARTHEST - NEAREST)), 0).astype(np.uint16), nearest, farthest
+    return (
+        np.where(seen, NEAREST_VALUE + np.round(scaled * (FARTHEST_VALUE - NEAREST_VALUE)), 0).astype(np.uint16),
+        nearest,
+        farthest,
+    )
 
 
 @checked

@@ -23,18 +23,18 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.utilities.files.writing import write_whole
 from hyperplanes.views import Views
 
-__all__ = ["AROUND", "LARGEST", "address_of", "page_of", "save_page", "turning_picture"]
+__all__ = ["MAX_PAGE_BYTES", "PAGE_FRAME_BYTES", "address_of", "page_of", "save_page", "turning_picture"]
 
-LARGEST = 8_000_000
+MAX_PAGE_BYTES = 8_000_000
 """Most bytes of a page. Beyond it, coefficients get fewer bits, those of second order first."""
 
-AROUND = 4096
+PAGE_FRAME_BYTES = 4096
 """Of these, bytes for the frame of `save_page`: some 500, and twice the escaped title of at most 255."""
 
 BITS = ((8, 8, 8), (8, 7, 6), (8, 6, 5), (8, 6, 4), (7, 5, 3), (7, 5, 0))
 """Bits of the mean colour, the first and the second order; 0 omits an order. Tried in turn until the page fits."""
 
-FRAMES, SIZE = 24, 256  # of a turntable; pixels along the longer side
+TURNTABLE_FRAMES, TURNTABLE_SIZE = 24, 256  # of a turntable; pixels along the longer side
 OWN = 8.0  # weight of a voxel's own colour, beside 1 of each neighbour, when colours are prepared for the page
 CLAMP = 1e-3  # share of a coefficient's values clamped at either end of its range
 STYLE = """<style>
@@ -63,7 +63,9 @@ body > p {{ position: fixed; left: 1em; bottom: 0; pointer-events: none; }}
 """
 
 
-def page_of(baked: BakedField, views: Views, *, picture: bytes = b"", largest: int = LARGEST - AROUND) -> str:
+def page_of(
+    baked: BakedField, views: Views, *, picture: bytes = b"", largest: int = MAX_PAGE_BYTES - PAGE_FRAME_BYTES
+) -> str:
     """An HTML fragment that renders baked voxels by WebGL2; a page may hold any number of them.
 
     Args:
@@ -155,7 +157,7 @@ def turning_picture(baked: BakedField, views: Views) -> bytes:
         baked: the voxels to render.
         views: give lens, distance and up.
     """
-    images = BakedScene(baked).render(orbit_cameras(views, FRAMES, size=SIZE)).images
+    images = BakedScene(baked).render(orbit_cameras(views, TURNTABLE_FRAMES, size=TURNTABLE_SIZE)).images
     return encode_animation(to_pixels(images), "webp")
 
 

@@ -30,14 +30,15 @@ from hyperplanes.views import Views, join_views
 __all__ = ["SPLAT_FORMATS", "Splats", "fit_splats", "save_splats", "splats_of"]
 
 SPLAT_FORMATS = ("ply", "splat")
-SIZE = 0.45  # standard deviation of a splat before fitting, in voxels
-STEPS = 160
-RATES = {"means": 0.3, "scales": 0.06, "quaternions": 0.06, "logits": 0.4, "coefficients": 0.02}
+INITIAL_SCALE = 0.45  # standard deviation of a splat before fitting, in voxels
+SPLAT_STEPS = 160
+LEARNING_RATES = {"means": 0.3, "scales": 0.06, "quaternions": 0.06, "logits": 0.4, "coefficients": 0.02}
 """Initial learning rates: of means in units of the splats' size, of scales as logarithms."""
 
 DIRECTIONAL = 0.2  # learning rate of view-dependent coefficients, relative to that of the mean colour
-SEEN = 0.1  # largest contribution to a picture, in pixels, below which a splat counts as hidden and is left out
-AROUND = 16  # cameras from all sides, beside the views, that decide which splats are hidden
+# largest contribution to a picture, in pixels, below which a splat counts as hidden and is left out
+MIN_CONTRIBUTION = 0.1
+SURROUNDING_CAMERAS = 16  # cameras from all sides, beside the views, that decide which splats are hidden
 HALF_TURN = (1, -1, -1, 1, -1, 1, 1, -1, 1)  # signs of the harmonics under (x, y, z) -> (x, -y, -z)
 
 
@@ -87,7 +88,7 @@ def splats_of(baked: BakedField) -> Splats:
     means, voxel = filled.centres(), filled.voxel
     opacity = (1 - torch.exp(-rows[:, 0] * voxel)).clamp(0.004, 0.98)
     unturned = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1)
-    scales = torch.full((len(means), 3), SIZE * voxel)
+    scales = torch.full((len(means), 3), INITIAL_SCALE * voxel)
     return Splats(means, scales, unturned, torch.logit(opacity), rows[:, 1:].clone())
 
 
@@ -97,7 +98,7 @@ def fit_splats(
     views: Views,
     *,
     guide: Views | None = None,
-    steps: int = STEPS,
+    steps: int = SPLAT_STEPS,
     on_step: Callable[[int], None] | None = None,
 ) -> Splats:
     """The visible splats after gradient steps (Adam) on all their parameters, one view a step.
@@ -134,11 +135,11 @@ def fit_splats(
     views = views.to("cpu", torch.float32)
     if guide is not None:
         views = join_views(replace(views, masks=None), guide.to("cpu", torch.float32))
-    splats = splats[_weights(splats, views) > SEEN]
+    splats = splats[_weights(splats, views) > MIN_CONTRIBUTION]
     size = float(splats.scales.mean()) if len(splats.scales) else 1.0
     # offsets of all parameters from their initial values, each kind with its learning rate
-    free = {name: torch.zeros_like(getattr(splats, name)).requires_grad_() for name in RATES}
-    descent = Adam([{"params": [free[name]], "lr": RATES[name]} for name in RATES], betas=(0.9, 0.99))
+    free = {name: torch.zeros_like(getattr(splats, name)).requires_grad_() for name in LEARNING_RATES}
+    descent = Adam([{"params": [free[name]], "lr": LEARNING_RATES[name]} for name in LEARNING_RATES], betas=(0.9, 0.99))
     schedule = torch.optim.lr_scheduler.ExponentialLR(descent, 0.1 ** (1 / steps))
 
     rate = torch.tensor([1.0] + [DIRECTIONAL] * (HARMONICS - 1)).repeat(3)
@@ -175,9 +176,9 @@ def _weights(splats: Splats, views: Views) -> Float[Tensor, " splat"]:
     bounds, found = views.bounds, torch.zeros(len(splats.means))
     centre = torch.tensor(bounds.centre)
     distance = float((camera.centres(views.cameras) - centre).norm(dim=-1).median())
-    around = camera.fibonacci_sphere(AROUND, max(distance, 1.1 * bounds.radius))
+    around = camera.fibonacci_sphere(SURROUNDING_CAMERAS, max(distance, 1.1 * bounds.radius))
     around[:, :3, 3] -= around[:, :3, :3] @ centre
-    others = camera.with_poses(camera.select(views.cameras, [0] * AROUND), around)
+    others = camera.with_poses(camera.select(views.cameras, [0] * SURROUNDING_CAMERAS), around)
     shape = splats.means, splats.scales, splats.quaternions, splats.logits.sigmoid()
     for cameras in (views.cameras, others):
         for view in range(cameras.batch_size):

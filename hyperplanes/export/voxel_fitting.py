@@ -19,18 +19,19 @@ from hyperplanes.rendering.voxels import voxel_gradients
 from hyperplanes.utilities.tensors.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
 
-__all__ = ["STEPS", "fit_voxels", "render_guide"]
+__all__ = ["VOXEL_STEPS", "fit_voxels", "render_guide"]
 
-STEPS = 100
-PIXELS = 8192  # per step
-EDGE = 0.25  # difference of neighbouring pixels in colour or mask from which on a pixel is the mean of five rays
+VOXEL_STEPS = 100
+PIXELS_PER_STEP = 8192
+# difference of neighbouring pixels in colour or mask from which on a pixel is the mean of five rays
+EDGE_THRESHOLD = 0.25
 DENSITY_RATE = 0.05  # of optical depth through a voxel
 COLOUR_RATE = 0.01
 DECAY = 0.1  # factor of both rates from the first step to the last
-STOP = 0.01  # transmittance below which a ray ends: gradients behind are negligible
+STOP_TRANSMITTANCE = 0.01  # transmittance below which a ray ends: gradients behind are negligible
 SMALLEST_DEPTH = 1e-4  # of a voxel: colour has no gradient where density is zero
 LARGEST_DEPTH = 0.7  # of a voxel at first: an opaque one hides those behind it and has no gradient itself
-ENOUGH = 16  # number of views from which on voxels are fitted without a guide
+MIN_UNGUIDED_VIEWS = 16  # number of views from which on voxels are fitted without a guide
 
 
 def render_guide(
@@ -50,13 +51,13 @@ def render_guide(
     Returns:
         Sixteen views, as far from the object as the given ones on average; None where these are sixteen or more.
     """
-    if len(views) >= ENOUGH:
+    if len(views) >= MIN_UNGUIDED_VIEWS:
         return None
     bounds = source.occupancy.bounds if isinstance(source, AdaptedField) else source.field.bounds
     centre = torch.tensor(bounds.centre)
     distance = (camera.centres(views.cameras).cpu().float() - centre).norm(dim=1).mean()
-    eyes = centre + distance * camera.fibonacci_sphere(ENOUGH, 1.0)[:, 2, :3]
-    matrix = camera.intrinsics(views.cameras)[:1].cpu().float().expand(ENOUGH, 3, 3)
+    eyes = centre + distance * camera.fibonacci_sphere(MIN_UNGUIDED_VIEWS, 1.0)[:, 2, :3]
+    matrix = camera.intrinsics(views.cameras)[:1].cpu().float().expand(MIN_UNGUIDED_VIEWS, 3, 3)
     around = camera.pinhole(matrix, camera.look_at(eyes, bounds.centre), *views.size)
     height, width = size or (max(8, side // 2) for side in views.size)
     around = camera.resized(around, height, width)
@@ -72,8 +73,8 @@ def fit_voxels(
     views: Views,
     *,
     guide: Views | None = None,
-    steps: int = STEPS,
-    pixels: int = PIXELS,
+    steps: int = VOXEL_STEPS,
+    pixels: int = PIXELS_PER_STEP,
     on_step: Callable[[int], None] | None = None,
 ) -> BakedField:
     """The voxels after gradient steps (Adam) on the squared error of pixels of the views.
@@ -96,7 +97,7 @@ def fit_voxels(
         The same voxels with fitted values.
     """
     scene, voxel = BakedScene(baked), 2 * baked.bounds.radius / baked.side
-    share = max(0.0, 1 - len(views) / ENOUGH) if guide is not None else 0.0
+    share = max(0.0, 1 - len(views) / MIN_UNGUIDED_VIEWS) if guide is not None else 0.0
     sources = [_Source.of(views, scene, pixels, 1 - share)]
     if guide is not None and share:
         sources.append(_Source.of(guide, scene, pixels, share))
@@ -116,7 +117,7 @@ def fit_voxels(
         drawn, truth, counts = _draw(sources, generator)
         values[:, :1], values[:, 1:], basis = depth / voxel, colour, spherical_harmonics(drawn.directions)
         _, gradient = voxel_gradients(
-            scene.grid, values, drawn, basis, truth, step=voxel, counts=counts, out=gradients, stop=STOP
+            scene.grid, values, drawn, basis, truth, step=voxel, counts=counts, out=gradients, stop=STOP_TRANSMITTANCE
         )
         depth.grad.copy_(gradient[:, :1] / voxel)
         colour.grad.copy_(gradient[:, 1:])
@@ -143,7 +144,7 @@ class _Source:
         views = replace(views.to("cpu", torch.float32), bounds=scene.field.bounds)
         live = scene.footprint(views.cameras).flatten().nonzero()[:, 0]
         seen = views.images if views.masks is None else torch.cat([views.images, views.masks], 1)
-        at_edge = pixels_at_edges(seen.permute(0, 2, 3, 1), EDGE).flatten()[live]
+        at_edge = pixels_at_edges(seen.permute(0, 2, 3, 1), EDGE_THRESHOLD).flatten()[live]
         return cls(views, live, at_edge, min(round(share * pixels), len(live)))
 
     def draw(self, generator: torch.Generator) -> tuple[Rays, Tensor, Tensor]:

@@ -21,7 +21,7 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.messages.arguments import checked_fields
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.transforms import wants_values_alone
 from hyperplanes.views import Views
 
@@ -271,7 +271,7 @@ class Field:
     def _packed(self, layers: Sequence[Layer]) -> PackedLayers | None:
         """The layers for the kernel, packed once, and again if weights have changed in place."""
         values = [value for layer in layers for value in layer]
-        return kept(
+        return cached_on(
             self,
             "packed",
             values,

@@ -24,20 +24,20 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import outermost_first
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes
-from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, resampled_grid, volume_of
+from hyperplanes.geometry.volume import VALUES_PER_CELL, VOLUME_SIDE, interpolate_grid, resampled_grid, volume_of
 from hyperplanes.parameters import Parameters
 from hyperplanes.utilities.messages.arguments import checked_fields
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.transforms import wants_values_alone
 from hyperplanes.views import Views
 
-__all__ = ["ImageBasedConfig", "ImageBasedField", "ImageBasedNeRF", "FeatureGrid"]
+__all__ = ["FeatureGrid", "ImageBasedConfig", "ImageBasedField", "ImageBasedNeRF"]
 
 FALLOFF = 8.0  # factor of depths behind the hull before tanh, in 1 / radii
 VOXELS_PER_PIXEL = 3 / 4  # along a side: 96 voxels for 128 pixels, as the preset "small" is trained
 FINEST_HULL = 192
-EMPTY = -4.0  # initial output of the density head outside the masks, before softplus
-SOLID = 4.0  # and inside
+INITIAL_DENSITY_OUTSIDE = -4.0  # initial output of the density head outside the masks, before softplus
+INITIAL_DENSITY_INSIDE = 4.0  # and inside
 
 GRID_RATES = {"learning_rate": 2e-2, "muon_learning_rate": 0.05}
 """For fine-tuning the weights of a field with a grid of features, trained or random; docs/small-training.md."""
@@ -72,7 +72,7 @@ class ImageBasedConfig(TargetConfig):
 
     blended: Annotated[int, range(1, 65)] = 4
     grid: Annotated[int, range(65)] = 0
-    cells: Annotated[int, range(1, 257)] = SIDE
+    cells: Annotated[int, range(1, 257)] = VOLUME_SIDE
 
     @property
     def reading(self) -> Reading:
@@ -91,7 +91,7 @@ class ImageBasedNeRF(Target):
     config_type: ClassVar[type[TargetConfig]] = ImageBasedConfig
     permutation_invariant: ClassVar[bool] = True
     config: ImageBasedConfig
-    volume_size: ClassVar[tuple[int, int] | None] = (CHANNELS, SIDE)
+    volume_size: ClassVar[tuple[int, int] | None] = (VALUES_PER_CELL, VOLUME_SIDE)
 
     def __init__(self, config: ImageBasedConfig) -> None:
         super().__init__(config)
@@ -107,8 +107,8 @@ class ImageBasedNeRF(Target):
                 nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
                 nn.init.zeros_(layer.bias)
             self.density.weight *= 0.1
-            self.density.weight[0, width] = SOLID - EMPTY
-            self.density.bias.fill_(EMPTY)
+            self.density.weight[0, width] = INITIAL_DENSITY_INSIDE - INITIAL_DENSITY_OUTSIDE
+            self.density.bias.fill_(INITIAL_DENSITY_OUTSIDE)
             self.colour.weight *= 0.1
 
     @property
@@ -271,7 +271,9 @@ class ImageBasedField(Field):
         grid = self.parameters.get("grid.weight")
         if grid is None:
             return None
-        return kept(self, "cells", [grid], lambda: grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2))
+        return cached_on(
+            self, "cells", [grid], lambda: grid.detach().permute(1, 2, 3, 0).contiguous().permute(3, 0, 1, 2)
+        )
 
     def _features(self, points: Tensor) -> list[Float[Tensor, "point number"]]:
         """Features of the grid, the first through a sigmoid."""

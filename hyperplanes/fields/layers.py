@@ -19,7 +19,7 @@ __all__ = ["Layer", "PackedLayers", "has_mixed_precision"]
 Layer = tuple[Tensor, Tensor]
 """Weights (width, input) and biases (width,)."""
 
-POINTS = 480  # in one call of a kernel: eight blocks of the kernels for AVX-512, three of that for AMX
+MLP_CHUNK = 480  # in one call of a kernel: eight blocks of the kernels for AVX-512, three of that for AMX
 
 
 def has_mixed_precision() -> bool:
@@ -72,7 +72,7 @@ class PackedLayers:
         width, inputs = layers[0][0].shape
         own = [inputs if index in (0, skip) else 0 for index in range(len(layers))]
         shapes = [((width, size + width * (index > 0)), (width,)) for index, size in enumerate(own)]
-        fits = width % kernel.COLUMNS == 0 and width <= kernel.WIDEST
+        fits = width % kernel.COLUMNS == 0 and width <= kernel.MAX_LAYER_WIDTH
         if not fits or [(weight.shape, bias.shape) for weight, bias in layers] != shapes:
             return None
         packed = [kernel.pack_weights(weight.detach(), size) for (weight, _), size in zip(layers, own, strict=True)]
@@ -97,5 +97,5 @@ class PackedLayers:
         result = inputs.new_empty(len(inputs), self.shape[1])
         given, weights, biases, out = (each.detach().numpy() for each in (inputs, self.weights, self.biases, result))
         kernel = compile_kernel(f"{self.module}.layers", torch.float32)
-        parallel_for(lambda a, b: kernel(given, weights, biases, self.shape, out, a, b), len(inputs), POINTS)
+        parallel_for(lambda a, b: kernel(given, weights, biases, self.shape, out, a, b), len(inputs), MLP_CHUNK)
         return result

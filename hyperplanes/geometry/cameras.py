@@ -24,6 +24,7 @@ from hyperplanes.utilities.messages.arguments import checked
 from hyperplanes.utilities.tensors.precision import without_autocast
 
 __all__ = [
+    "ROTATION_TOLERANCE",
     "camera_from_world",
     "centres",
     "concatenate",

@@ -9,17 +9,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 __all__ = [
-    "ANGLE",
-    "BEYOND",
-    "CUT",
-    "DEEPEST",
-    "FADING",
-    "MARGIN",
+    "BORDER_MARGIN",
+    "BORDER_PENALTY",
+    "BORDER_POLE",
+    "INVISIBLE_PENALTY",
+    "MAX_DEPTH_PENALTY",
     "OCTAVES",
-    "PARTLY",
+    "OPAQUE_MASK",
+    "PARTIAL_MASK_PENALTY",
+    "PENALTY_RADIANS",
     "SMALLEST_ANGLE",
-    "UNSEEN",
-    "WHOLE",
+    "WEIGHT_FALLOFF",
     "ChosenViews",
     "Described",
     "Penalties",
@@ -27,22 +27,22 @@ __all__ = [
     "Visibility",
 ]
 
-DEEPEST = 2.0  # largest penalty of depth behind the surface, in radii
-PARTLY = 2.0  # penalty of a mask that is not opaque
-WHOLE = 0.98  # opacity from which on a mask counts as opaque
-UNSEEN = 8.0  # penalty of a view that does not show the point: more than all others together
-MARGIN = 0.15  # of the shorter side of a picture, along a border that crops the object
-CUT = 0.03  # penalty in the middle of the margin; 3 at the border
-BEYOND = 1.01  # widths of the margin from its inner edge to where the penalty would be infinite
-FADING = 10.0  # rate at which the weights of views fall with their penalty
-ANGLE = 10.0  # radians of angle that a penalty of 1 is worth
+MAX_DEPTH_PENALTY = 2.0  # largest penalty of depth behind the surface, in radii
+PARTIAL_MASK_PENALTY = 2.0  # penalty of a mask that is not opaque
+OPAQUE_MASK = 0.98  # opacity from which on a mask counts as opaque
+INVISIBLE_PENALTY = 8.0  # penalty of a view that does not show the point: more than all others together
+BORDER_MARGIN = 0.15  # of the shorter side of a picture, along a border that crops the object
+BORDER_PENALTY = 0.03  # penalty in the middle of the margin; 3 at the border
+BORDER_POLE = 1.01  # widths of the margin from its inner edge to where the penalty would be infinite
+WEIGHT_FALLOFF = 10.0  # rate at which the weights of views fall with their penalty
+PENALTY_RADIANS = 10.0  # radians of angle that a penalty of 1 is worth
 OCTAVES = 8  # of an encoding from one computed sine to the next; the others follow by doubling the angle
 SMALLEST_ANGLE = 1e-2  # between a view and a direction, in radians; smaller ones are clamped to it
 
 
 @dataclass(frozen=True)
 class Penalties:
-    """What it costs a view not to see a point well; a cost of 1 is worth ANGLE radians of angle.
+    """What it costs a view not to see a point well; a cost of 1 is worth PENALTY_RADIANS radians of angle.
 
     Attributes:
         deepest: largest cost of depth behind the first surface.
@@ -52,15 +52,15 @@ class Penalties:
         least: lowest cost, of points in front of the surface.
     """
 
-    deepest: float = DEEPEST
-    partly: float = PARTLY
+    deepest: float = MAX_DEPTH_PENALTY
+    partly: float = PARTIAL_MASK_PENALTY
     steep: float = 1.0
-    highest: float = DEEPEST + PARTLY
-    least: float = -DEEPEST
+    highest: float = MAX_DEPTH_PENALTY + PARTIAL_MASK_PENALTY
+    least: float = -MAX_DEPTH_PENALTY
 
     @classmethod
-    def alike(cls) -> Penalties:
-        """Visibility is binary: whatever hides a point costs 1; handicaps and margins are added."""
+    def binary(cls) -> Penalties:
+        """Visibility is binary: whatever hides a point costs 1; penalty offsets and margins are added."""
         return cls(deepest=1e3, partly=1e6, steep=1e6, highest=1.0, least=0.0)
 
 
@@ -74,7 +74,7 @@ class ChosenViews:
         behind: how far the point lies behind the first surface of the hull along the ray of each camera, in radii of
             the scene; negative in front of it.
         coverage: opacity of the mask where the point falls.
-        penalty: how badly the view sees the point; UNSEEN where it does not show it at all.
+        penalty: how badly the view sees the point; INVISIBLE_PENALTY where it does not show it at all.
     """
 
     views: Int[Tensor, "point chosen"]
@@ -86,12 +86,12 @@ class ChosenViews:
     @property
     def valid(self) -> Bool[Tensor, "point chosen"]:
         """Whether each view shows the point: it falls into the image, and the view is not masked."""
-        return self.penalty < UNSEEN
+        return self.penalty < INVISIBLE_PENALTY
 
     @property
     def weights(self) -> Float[Tensor, "point chosen"]:
         """Weights that fall with the penalty and sum to one; all zero where no view shows the point."""
-        weights = torch.exp(-FADING * self.penalty.clamp_min(0)) * self.valid
+        weights = torch.exp(-WEIGHT_FALLOFF * self.penalty.clamp_min(0)) * self.valid
         return weights / weights.sum(1, keepdim=True).clamp_min(1e-6)
 
     def first(self, count: int) -> ChosenViews:
@@ -117,7 +117,7 @@ class ChosenViews:
             angles: as `angles` returns them.
             count: how many views are blended.
         """
-        score = (angles + ANGLE * self.penalty.clamp_min(0)).clamp_min(SMALLEST_ANGLE)
+        score = (angles + PENALTY_RADIANS * self.penalty.clamp_min(0)).clamp_min(SMALLEST_ANGLE)
         farthest = score[:, count : count + 1] if score.shape[1] > count else 2 * score[:, -1:]
         return (1 / score[:, :count] - 1 / (1.01 * farthest)).clamp_min(1e-6)
 

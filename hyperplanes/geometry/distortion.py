@@ -9,7 +9,7 @@ from kornia.geometry.calibration import distort_points
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.cached_on import cached_on
 
 __all__ = [
     "DistortedCamera",
@@ -151,7 +151,7 @@ def undistorted_pixels(
 
 def _limits(cameras: DistortedCamera) -> Float[Tensor, " view"]:
     """The turning radius of each camera, computed once."""
-    return kept(cameras, "turning_radius", [cameras.distortion], lambda: turning_radius(cameras.distortion))
+    return cached_on(cameras, "turning_radius", [cameras.distortion], lambda: turning_radius(cameras.distortion))
 
 
 def inverse_distortion(

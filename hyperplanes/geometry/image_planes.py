@@ -28,7 +28,7 @@ from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.packed_images import PackedImages, pack
 from hyperplanes.utilities.messages.arguments import checked
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.utilities.tensors.transforms import are_plain
 
@@ -121,7 +121,7 @@ class ImagePlanes:
             raise ValueError(f"images: expected shape {expected}, got {tuple(images.shape)}")
         result = copy.copy(self)
         result.images, result.exact, result.masked = _counting(images.contiguous(), given), True, None
-        vars(result).pop("_kept_packed", None)
+        vars(result).pop("_cached_packed", None)
         return result
 
     @without_autocast
@@ -193,7 +193,7 @@ class ImagePlanes:
             return None
         if not are_plain(points, self.images) or (self.backend or choose(points, self.images)) != "cpu":
             return None
-        return kept(self, "packed", [self.images], lambda: pack(self.images))
+        return cached_on(self, "packed", [self.images], lambda: pack(self.images))
 
 
 def _counting(images: Tensor, given: ArrayLike) -> Tensor:

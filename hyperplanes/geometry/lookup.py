@@ -38,8 +38,8 @@ class Lookup:
         coordinates: where the point falls on the plane, (column, row) in [-1, 1] from the first pixel's centre to the
             last one's. Clamped to that range for points outside the image, zero for points behind the camera.
         valid: the point is in front of the camera and inside its image: between the centres of the outermost pixels,
-            or beyond them by no more than `lookup_torch.BORDER`, a hundredth of a pixel, as rounding may place a point
-            that lies on them. The colour there is that of the border.
+            or beyond them by no more than `lookup_torch.BORDER_TOLERANCE`, a hundredth of a pixel, as rounding may
+            place a point that lies on them. The colour there is that of the border.
         directions: unit vectors from each camera's centre to the point, in the world, or None.
         distances: from each camera's centre to the point, in world units, or None.
     """

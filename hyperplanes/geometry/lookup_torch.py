@@ -8,10 +8,11 @@ from torch.nn.functional import grid_sample
 
 from hyperplanes.utilities.tensors.transforms import transform_of
 
-__all__ = ["BORDER", "MIN_Z", "interpolate", "lookup", "place", "project", "sample"]
+__all__ = ["BORDER_TOLERANCE", "MIN_Z", "interpolate", "lookup", "place", "project", "sample"]
 
 MIN_Z = 1e-4  # z in the camera's frame, in units of the scene's scale; points below it count as behind the camera
-BORDER = 0.01  # pixels beyond the centres of the outermost pixels that still count as inside: projections are rounded
+# pixels beyond the centres of the outermost pixels that still count as inside: projections are rounded
+BORDER_TOLERANCE = 0.01
 
 
 def project(points: Tensor, matrices: Tensor, views: Tensor | None, nearest: float = MIN_Z) -> tuple[Tensor, Tensor]:
@@ -30,7 +31,7 @@ def project(points: Tensor, matrices: Tensor, views: Tensor | None, nearest: flo
 def place(pixels: Tensor, front: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Clamped coordinates (point, view, 2) in [-1, 1], zero behind the camera, and validity (point, view)."""
     last = pixels.new_tensor([width - 1, height - 1])
-    valid = front & ((pixels >= -BORDER) & (pixels <= last + BORDER)).all(-1)
+    valid = front & ((pixels >= -BORDER_TOLERANCE) & (pixels <= last + BORDER_TOLERANCE)).all(-1)
     highest = 2 * last.clamp_max(1) - 1  # an axis of one pixel has the one coordinate -1
     coordinates = (pixels * (2 / last.clamp_min(1)) - 1).clamp(-torch.ones_like(last), highest)
     return torch.where(front[..., None], coordinates, 0.0), valid

@@ -20,7 +20,7 @@ from hyperplanes.geometry.kernels.compiling import compile_kernel
 from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.utilities.messages.arguments import checked, kind_of
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.utilities.tensors.transforms import are_plain
 
@@ -83,7 +83,7 @@ class Occupancy:
 
         The margin is for points that rounding moves across a face. Without occupied voxels the box has no size.
         """
-        return kept(self, "box", [self.occupied], self._box)
+        return cached_on(self, "box", [self.occupied], self._box)
 
     def _box(self) -> tuple[float, ...]:
         corners = []
@@ -104,7 +104,7 @@ class Occupancy:
     @property
     def surface_centres(self) -> Float[Tensor, "voxel 3"]:
         """World positions of the centres of the voxels of `surface`, computed once."""
-        return kept(self, "surface_centres", [self.occupied], lambda: self.surface().centres())
+        return cached_on(self, "surface_centres", [self.occupied], lambda: self.surface().centres())
 
     def with_even_side(self) -> Occupancy:
         """The same voxels in a grid that divides into blocks of 2 x 2 x 2: an odd side gets one more empty voxel."""

@@ -12,12 +12,12 @@ from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 
-__all__ = ["CHANNELS", "SIDE", "interpolate_grid", "resampled_grid", "volume_of"]
+__all__ = ["VALUES_PER_CELL", "VOLUME_SIDE", "interpolate_grid", "resampled_grid", "volume_of"]
 
-SIDE = 32  # cells an axis
-CHANNELS = 5  # per cell: occupied share, mean colour, number of views
-BEST = 8  # views averaged per cell
-_READING = Reading(BEST, nearest=0, point_frequencies=0, direction_frequencies=0, falloff=0.0)
+VOLUME_SIDE = 32  # cells an axis
+VALUES_PER_CELL = 5  # occupied share, mean colour, number of views
+VIEWS_PER_CELL = 8  # views averaged per cell
+_READING = Reading(VIEWS_PER_CELL, nearest=0, point_frequencies=0, direction_frequencies=0, falloff=0.0)
 
 
 @torch.no_grad()
@@ -34,7 +34,7 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
     """
     occupancy = planes.occupancy
     # the share of each cell inside the hull (x, y, z), and the centres of cells where it is not zero
-    share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.maps), SIDE)[0, 0]
+    share = adaptive_avg_pool3d(occupancy.occupied[None, None].to(planes.maps), VOLUME_SIDE)[0, 0]
     cells = (share > 0).nonzero()
     points = Occupancy(share > 0, occupancy.bounds).centres_of(cells).to(share)
     # mean colour of the views that see a cell best (cell, 3), and how many show it, as a logarithm
@@ -42,7 +42,7 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
         rows = planes.describe(points, None, _READING, occupancy.bounds).rows
         mean, number = rows[:, -11:-8], rows[:, -1]
     else:
-        visibility = planes.choose(points, best=BEST)
+        visibility = planes.choose(points, best=VIEWS_PER_CELL)
         seen = visibility.best
         shown = planes.colours.lookup(points).colours
         colours = 2 * shown.gather(1, seen.views[..., None].expand(-1, -1, 3)) - 1
@@ -51,7 +51,7 @@ def volume_of(planes: VisibilityPlanes) -> Float[Tensor, "channel x y z"]:
     # back into the grid
     x, y, z = cells.unbind(1)
     values = torch.cat([share[x, y, z][:, None], mean, number[:, None]], 1)
-    volume = share.new_zeros(CHANNELS, SIDE, SIDE, SIDE)
+    volume = share.new_zeros(VALUES_PER_CELL, VOLUME_SIDE, VOLUME_SIDE, VOLUME_SIDE)
     volume[:, x, y, z] = values.T
     return volume
 

@@ -20,7 +20,7 @@ Encoder: TypeAlias = Literal["convnet", "resnet101"]
 
 Normalisation: TypeAlias = Literal["batch", "batch_statistics", "group"]
 
-CHANNELS = (32, 64, 128, 128)  # of the convolutions of `ConvNet`
+CONVOLUTION_CHANNELS = (32, 64, 128, 128)  # of the convolutions of `ConvNet`
 
 
 def _normalisation(name: Normalisation, channels: int) -> nn.Module:
@@ -36,14 +36,14 @@ class ConvNet(nn.Module):
 
     def __init__(self, code: int, normalisation: Normalisation = "batch") -> None:
         super().__init__()
-        sizes = (3, *CHANNELS)
+        sizes = (3, *CONVOLUTION_CHANNELS)
         self.convolutions = nn.ModuleList(
             nn.Conv2d(before, after, 3, stride=2, padding=1, bias=False)
-            for before, after in zip(sizes, CHANNELS, strict=False)
+            for before, after in zip(sizes, CONVOLUTION_CHANNELS, strict=False)
         )
-        self.normalisations = nn.ModuleList(_normalisation(normalisation, after) for after in CHANNELS)
+        self.normalisations = nn.ModuleList(_normalisation(normalisation, after) for after in CONVOLUTION_CHANNELS)
         self.pool = nn.AdaptiveAvgPool2d(4)
-        self.code = nn.Linear(CHANNELS[-1] * 16, code)
+        self.code = nn.Linear(CONVOLUTION_CHANNELS[-1] * 16, code)
 
     def forward(self, images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view code"]:
         """One code per image; images in [0, 1] of any size."""

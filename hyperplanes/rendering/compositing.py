@@ -10,7 +10,7 @@ from torch import Tensor
 
 __all__ = ["Rendered", "composite", "composite_packed", "packed_weights"]
 
-MAX_OPTICAL_DEPTH = 1e3  # of a sample: exp(-1000) is 0, and the cumulative sum over all rays stays accurate
+MAX_SAMPLE_OPTICAL_DEPTH = 1e3  # of a sample: exp(-1000) is 0, and the cumulative sum over all rays stays accurate
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def packed_weights(
         return optical_depth
     # one cumulative sum over all rays, minus its value at the start of each ray; in double precision so that rays late
     # in the batch stay accurate
-    finite = optical_depth.double().nan_to_num(0.0).clamp_max(MAX_OPTICAL_DEPTH)
+    finite = optical_depth.double().nan_to_num(0.0).clamp_max(MAX_SAMPLE_OPTICAL_DEPTH)
     before = finite.cumsum(0) - finite
     first = torch.searchsorted(ray, torch.arange(count, device=ray.device)).clamp_max(len(ray) - 1)
     before = (before - before[first][ray]).to(optical_depth.dtype)

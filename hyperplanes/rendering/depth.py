@@ -17,8 +17,8 @@ from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["SeenSurface", "seen_surface"]
 
-COVERED = 0.5  # least opacity of a pixel that shows a surface
-REACH = 2  # pixels on each side to which the plane through a pixel is fitted
+MIN_SURFACE_OPACITY = 0.5  # least opacity of a pixel that shows a surface
+FIT_RADIUS = 2  # pixels on each side to which the plane through a pixel is fitted
 STEEPEST = 6.0  # largest change of z from pixel to pixel on one surface, in widths of a pixel
 RIDGE = 1e-3  # regularisation of the normal equations, for pixels without neighbours
 
@@ -71,7 +71,7 @@ def _one_view(pictures: Pictures, cameras: PinholeCamera, view: int) -> tuple[Te
     rays = cast(one, torch.zeros(len(pixels), dtype=torch.long, device=distance.device), pixels)
     rotation = camera.camera_from_world(one)[0, :3, :3]
     local = (rays.directions @ rotation.T).reshape(height, width, 3)
-    covered = (opacity >= COVERED) & (distance > 0) & (local[..., 2] > 0)
+    covered = (opacity >= MIN_SURFACE_OPACITY) & (distance > 0) & (local[..., 2] > 0)
     z = torch.where(covered, distance * local[..., 2], 0.0)
     points = rays.at(distance.reshape(-1)).reshape(height, width, 3)
     slopes = local[..., :2] / local[..., 2:].clamp_min(1e-6)
@@ -84,13 +84,13 @@ def _plane_normals(z: Tensor, covered: Tensor, opacity: Tensor, slopes: Tensor, 
     """Normals in the camera's frame, by weighted least squares over the pixels around each pixel."""
     height, width = z.shape
     weight = covered * opacity
-    frame = [REACH] * 4
+    frame = [FIT_RADIUS] * 4
     around = [pad(part, frame) for part in (z, weight, slopes[..., 0], slopes[..., 1])]
     normal, right = z.new_zeros(height, width, 3, 3), z.new_zeros(height, width, 3)
-    for down in range(2 * REACH + 1):
-        for across in range(2 * REACH + 1):
+    for down in range(2 * FIT_RADIUS + 1):
+        for across in range(2 * FIT_RADIUS + 1):
             there, share, x, y = (part[down : down + height, across : across + width] for part in around)
-            near = (there - z).abs() <= STEEPEST * REACH * z / focal
+            near = (there - z).abs() <= STEEPEST * FIT_RADIUS * z / focal
             # offset from the centre in pixels, and 1 / z relative to that of the centre
             offset = torch.stack([(x - slopes[..., 0]) * focal, (y - slopes[..., 1]) * focal, torch.ones_like(x)], -1)
             offset = offset * (share * near)[..., None].sqrt()

@@ -27,7 +27,7 @@ RAYS_OF_GROUP = 1 << 14
 """Most rays of small views that are rendered together: with two threads, 25 views of 64x64 take 0.94 s, and 1.78 s one
 by one (`small`, idle)."""
 
-EDGE = 0.7
+EDGE_THRESHOLD = 0.7
 """Difference between neighbouring pixels, in colour or opacity, from which on more rays are cast through both. Lowering
 it to 0.35 gains next to nothing more; 0.9 gains half as much."""
 
@@ -76,7 +76,7 @@ def render_images(
     near_far: str = "sphere",
     background: float = 1.0,
     antialias: bool = False,
-    edge: float = EDGE,
+    edge: float = EDGE_THRESHOLD,
 ) -> Pictures:
     """The pictures of cameras, by a function that renders rays.
 

@@ -29,11 +29,11 @@ FIRST_ROUND = 2  # samples per ray before the first test for opaque rays
 EXACT = 0.01  # `stop` up to which every sample of a ray is evaluated, instead of every second one first
 BESIDE = 0.03  # optical depth of a sample from which on its neighbours are evaluated, on rays that are not opaque
 JUMP = 1.0  # increase of optical depth to the next sample from which on the one between is evaluated
-MIN_SHARE = 0.1  # least weight of samples whose colours are evaluated, as a fraction of the largest on the ray
-MIN_OPACITY = 1 / 64  # least opacity of pixels whose colours are evaluated
+MIN_WEIGHT_SHARE = 0.1  # least weight of samples whose colours are evaluated, as a fraction of the largest on the ray
+MIN_PIXEL_OPACITY = 1 / 64  # least opacity of pixels whose colours are evaluated
 GROWTH = 2  # each later round takes the number of samples so far divided by this, and at least FIRST_ROUND
 FIRST_REACH = 4  # samples per ray in the first round of densities, from which samples with gradients are drawn
-UNSEEN = 1 / 512  # `stop` up to which a stopped ray keeps its share of background: half of an 8-bit grey level
+MAX_INVISIBLE_STOP = 1 / 512  # `stop` up to which a stopped ray keeps its share of background: half a grey level of 256
 DIFFERENTIATED = 0.01  # weight of a sample from which on it always has a gradient; below, with proportional probability
 
 
@@ -226,7 +226,7 @@ def _front_to_back(scene: Scene, rays: Rays, samples: PackedSamples, stop: float
     index, optical_depth, found = _in_rounds(scene, rays, samples, split, limit, 2 if stop > EXACT else 1)
     part = samples[index]
     weight = packed_weights(optical_depth, part.ray, count)
-    if stop > UNSEEN:
+    if stop > MAX_INVISIBLE_STOP:
         total = weight.new_zeros(count).index_add(0, part.ray, optical_depth)
         opacity = torch.where(total < limit, 1.0, -torch.expm1(-total))
         weight = weight / opacity.clamp_min(1e-12)[part.ray]
@@ -318,7 +318,7 @@ def _colours(
     """
     ray, zeros = samples.ray[index], weights.new_zeros(len(rays))
     total, heaviest = zeros.index_add(0, ray, weights), zeros.scatter_reduce(0, ray, weights, "amax")
-    known = (weights > MIN_SHARE * heaviest[ray]) & (total > MIN_OPACITY)[ray]
+    known = (weights > MIN_WEIGHT_SHARE * heaviest[ray]) & (total > MIN_PIXEL_OPACITY)[ray]
     scale = total / zeros.index_add(0, ray, weights * known)  # infinite where no colour is known
     colour, wanted = weights.new_zeros(len(samples), 3), torch.zeros_like(samples.ray, dtype=torch.bool)
     wanted[index] = known

@@ -15,12 +15,12 @@ from hyperplanes.geometry.occupancy import Occupancy, dilate, ranges
 __all__ = ["RefinedOccupancy", "refine"]
 
 OPACITY_LOSS = 0.05  # of a ray along which all dropped voxels would lie; with 0.3 haze of young fields is lost
-SOLID = 0.03
+MIN_OPTICAL_DEPTH = 0.03
 """Least optical depth of a voxel that the field fills. With less, haze hides what lies behind it; with 0.3, surfaces
 that are half transparent, as with few views, are lost (up to 2.9 dB with 5 views)."""
 
-CHUNK = 1 << 14  # voxels in one call of the density
-OPAQUE = 1.0  # optical depth of a voxel from which on it hides what lies behind it
+VOXEL_CHUNK = 1 << 14  # voxels in one call of the density
+OCCLUDING_OPTICAL_DEPTH = 1.0  # optical depth of a voxel from which on it hides what lies behind it
 ALONG = 0.2  # components of a direction below this fraction of the largest one are ignored
 COARSE_FIRST = 60_000  # occupied voxels from which on half the resolution is evaluated first
 
@@ -37,7 +37,7 @@ class RefinedOccupancy(Occupancy):
 
     def solid(self) -> Occupancy:
         """The voxels that the field fills; the first of them along a ray is its surface."""
-        return Occupancy(self.optical_depth > SOLID, self.bounds)
+        return Occupancy(self.optical_depth > MIN_OPTICAL_DEPTH, self.bounds)
 
 
 @torch.no_grad()
@@ -144,7 +144,7 @@ def _from_outside(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Te
         places = layer[:, None] // steps % sides - 1 + corner  # torch.unravel_index imports sympy, which takes 0.3 s
         found = _densities(grid.centres_of(places), density) * grid.voxel
         depth[layer], left[layer] = found.to(depth), False
-        beside = (layer[found < OPAQUE][:, None] + around).flatten()
+        beside = (layer[found < OCCLUDING_OPTICAL_DEPTH][:, None] + around).flatten()
         layer = beside[left[beside]].unique()
     result[box] = depth.unflatten(0, shape)[1:-1, 1:-1, 1:-1]
     return result
@@ -157,7 +157,7 @@ def _box_of(occupied: Tensor) -> tuple[tuple[slice, ...], Tensor]:
 
 
 def _densities(points: Tensor, density: Callable[[Tensor], Tensor]) -> Tensor:
-    return torch.cat([density(part) for part in points.split(CHUNK)])
+    return torch.cat([density(part) for part in points.split(VOXEL_CHUNK)])
 
 
 def _filled(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor], threshold: float) -> Tensor:
@@ -166,7 +166,7 @@ def _filled(grid: Occupancy, asked: Tensor, density: Callable[[Tensor], Tensor],
     steps = torch.tensor([-0.25, 0.25], device=points.device) * grid.voxel
     offsets = torch.cartesian_prod(steps, steps, steps).reshape(-1, 3)
     found = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    chunk = CHUNK // len(offsets)
+    chunk = VOXEL_CHUNK // len(offsets)
     for first in range(0, len(points), chunk):
         part = points[first : first + chunk, None] + offsets
         found[first : first + chunk] = (density(part.reshape(-1, 3)) > threshold).reshape(part.shape[:2]).any(1)

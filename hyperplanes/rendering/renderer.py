@@ -27,7 +27,7 @@ from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["FieldFunction", "Hierarchical", "RayMarching", "Sampler", "allow_tf32", "render"]
 
-FEW = 16  # a chunk is divided by this for the least number of rays that is worth a second thread
+MIN_CHUNK_DIVISOR = 16  # a chunk is divided by this for the least number of rays that is worth a second thread
 
 
 class _Options(TypedDict, total=False):
@@ -155,7 +155,7 @@ def _bounds(total: int, size: int, even: bool = True) -> list[int]:
     ([0, 3, 5, 8, 10], [0, 2], [0, 0])
     """
     count = max(1, -(-total // size))
-    count += count % 2 if even and total > size // FEW else 0
+    count += count % 2 if even and total > size // MIN_CHUNK_DIVISOR else 0
     return [-(-part * total // count) for part in range(count + 1)]
 
 

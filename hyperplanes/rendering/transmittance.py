@@ -14,8 +14,8 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 
 __all__ = ["transmittance"]
 
-CELLS = 1 << 12  # processed together
-MAX_OPTICAL_DEPTH = 12.0  # beyond it the transmittance is below 1e-5 and counts as zero
+CELL_CHUNK = 1 << 12  # processed together
+OPAQUE_OPTICAL_DEPTH = 12.0  # beyond it the transmittance is below 1e-5 and counts as zero
 
 
 def transmittance(
@@ -36,7 +36,7 @@ def transmittance(
     """
     found, kernel = torch.empty(len(cells), len(directions)), compile_function(_transmittance)
     arrays = [each.cpu().contiguous().numpy() for each in (optical_depth, cells, directions)]
-    parallel_for(lambda start, stop: kernel(*arrays, found.numpy(), start, stop), len(cells), CELLS)
+    parallel_for(lambda start, stop: kernel(*arrays, found.numpy(), start, stop), len(cells), CELL_CHUNK)
     return found.to(optical_depth.device)
 
 
@@ -48,7 +48,7 @@ def _transmittance(optical_depth, cells, directions, found, start, stop):
         for direction in range(directions.shape[0]):
             x, y, z = directions[direction, 0], directions[direction, 1], directions[direction, 2]
             total, step = 0.0, 1.0
-            while total < MAX_OPTICAL_DEPTH:
+            while total < OPAQUE_OPTICAL_DEPTH:
                 # the voxel of the next point on the ray; outside the grid the ray ends
                 at_x = int(math.floor(cells[cell, 0] + 0.5 - step * x))
                 at_y = int(math.floor(cells[cell, 1] + 0.5 - step * y))

@@ -19,11 +19,11 @@ from hyperplanes.geometry.occupancy import ranges
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.rendering.compositing import Rendered
 
-__all__ = ["STOP", "VoxelGrid", "distance_to_filled", "render_voxels", "shade_voxels", "voxel_gradients"]
+__all__ = ["STOP_TRANSMITTANCE", "VoxelGrid", "distance_to_filled", "render_voxels", "shade_voxels", "voxel_gradients"]
 
 MAX_DISTANCE = 255  # of the distance transform, which is stored in a byte
-STOP = 1e-3  # transmittance below which a ray ends
-RAYS, ROWS = 1 << 10, 1 << 14  # in one call of the kernels
+STOP_TRANSMITTANCE = 1e-3  # transmittance below which a ray ends
+RAY_CHUNK, ROW_CHUNK = 1 << 10, 1 << 14  # in one call of the kernels
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def shade_voxels(
     kernel, out = compile_function(voxel_rays.shade), torch.empty(len(values) + 1, 4)
     out[-1] = 0
     arrays = values.numpy(), centres.float().numpy(), eye.float().numpy(), out.numpy()
-    parallel_for(lambda first, last: kernel(*arrays, first, last), len(values), ROWS)
+    parallel_for(lambda first, last: kernel(*arrays, first, last), len(values), ROW_CHUNK)
     return out
 
 
@@ -117,8 +117,8 @@ def render_voxels(grid: VoxelGrid, shaded: Float[Tensor, "padded_row 4"], rays: 
     """
     kernel = compile_function(voxel_rays.render)
     out = np.empty((len(rays), 5), np.float32)
-    arrays, numbers = _arrays(grid, shaded, rays), _numbers(step, STOP)
-    samples = sum(parallel_for(lambda first, last: kernel(*arrays, *numbers, out, first, last), len(rays), RAYS))
+    arrays, numbers = _arrays(grid, shaded, rays), _numbers(step, STOP_TRANSMITTANCE)
+    samples = sum(parallel_for(lambda first, last: kernel(*arrays, *numbers, out, first, last), len(rays), RAY_CHUNK))
     found = torch.from_numpy(out)
     return Rendered(found[:, :3], found[:, 3], found[:, 4], samples)
 
@@ -133,7 +133,7 @@ def voxel_gradients(
     step: float,
     counts: Int[Tensor, " pixel"] | None = None,
     out: Float[Tensor, "thread row 28"] | None = None,
-    stop: float = STOP,
+    stop: float = STOP_TRANSMITTANCE,
 ) -> tuple[float, Float[Tensor, "row 28"]]:
     """The mean squared error of pixels, and its gradient with respect to `values`.
 

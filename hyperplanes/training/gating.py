@@ -19,8 +19,8 @@ from hyperplanes.views import Task, moved
 
 __all__ = ["GatingExample", "example_of", "fit_gate", "turned"]
 
-STEPS = 1500
-EXAMPLES, PIXELS = 16, 2048  # examples per step, and pixels of each
+GATE_STEPS = 1500
+EXAMPLES_PER_STEP, PIXELS_PER_EXAMPLE = 16, 2048  # examples per step, and pixels of each
 SEED = 0  # of the initial weights and the random draws
 RATE = 0.01  # initial learning rate of Adam; it decays to 0 along a cosine
 
@@ -75,14 +75,14 @@ def turned(task: Task, generator: torch.Generator) -> Task:
     return replace(task, support=moved(task.support, motion), query=moved(task.query, motion))
 
 
-def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS) -> GatingNetwork:
+def fit_gate(examples: Sequence[GatingExample], *, steps: int = GATE_STEPS) -> GatingNetwork:
     """Train a gating network with Adam on the squared error of the average of two pictures.
 
     The error of each example is divided by that of its learned field, so that all objects have the same weight in PSNR.
 
     Args:
         examples: examples of objects, with all numbers of support views. Those without pixels are left out.
-        steps: number of steps, each on EXAMPLES random examples and PIXELS pixels of each.
+        steps: number of steps, each on EXAMPLES_PER_STEP random examples and PIXELS_PER_EXAMPLE pixels of each.
 
     Raises:
         ValueError: no example with a pixel.
@@ -96,7 +96,10 @@ def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS) -> Gating
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(descent, steps)
     generator = torch.Generator().manual_seed(SEED)
     for _ in range(steps):
-        drawn = [examples[place] for place in torch.randint(len(examples), (EXAMPLES,), generator=generator).tolist()]
+        drawn = [
+            examples[place]
+            for place in torch.randint(len(examples), (EXAMPLES_PER_STEP,), generator=generator).tolist()
+        ]
         loss = torch.stack([_relative_error(gate, each, generator) for each in drawn]).mean()
         descent.zero_grad()
         loss.backward()
@@ -107,10 +110,10 @@ def fit_gate(examples: Sequence[GatingExample], *, steps: int = STEPS) -> Gating
 
 def _relative_error(gate: GatingNetwork, example: GatingExample, generator: torch.Generator) -> Tensor:
     """The squared error of the average of both pictures, divided by that of the learned field; from random pixels."""
-    pixels = torch.randint(len(example.read), (PIXELS,), generator=generator)
+    pixels = torch.randint(len(example.read), (PIXELS_PER_EXAMPLE,), generator=generator)
     share = gate(example.read[pixels])[:, None]
     mixed = torch.lerp(example.learned[pixels], example.hull[pixels], share)
-    return (mixed - example.truth[pixels]).square().sum() * (len(example.read) / PIXELS / example.error)
+    return (mixed - example.truth[pixels]).square().sum() * (len(example.read) / PIXELS_PER_EXAMPLE / example.error)
 
 
 def _flat(images: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "pixel 3"]:

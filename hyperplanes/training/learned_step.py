@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.optim import Adam
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork, in_use
+from hyperplanes.adaptation.network import GRID_WEIGHT, HyperPlanesNetwork, in_use
 from hyperplanes.adaptation.optimisation.gradients import summed_gradients
 from hyperplanes.adaptation.optimisation.learned_steps import step_inputs
 from hyperplanes.configuration.training import TrainingConfig
@@ -26,8 +26,8 @@ from hyperplanes.views import Tasks
 
 __all__ = ["fit_learned_step"]
 
-RAYS = 1024  # of the support views, for the gradient that a learned step reads
-STEPS = 4  # the trained step of an object is its first, or follows one, two or three others
+GRADIENT_RAYS = 1024  # of the support views, for the gradient that a learned step reads
+MAX_LEARNED_STEPS = 4  # the trained step of an object is its first, or follows one, two or three others
 RATE, WARMUP, LAST = 1e-3, 100, 0.02  # learning rate of Adam, steps of warm-up, and the final rate as a fraction
 
 
@@ -37,7 +37,7 @@ def fit_learned_step(
     """Train the learned step of a model, whose own weights do not change.
 
     The loss is the squared error of query rays after a learned step. For each object, this is a random one of its first
-    STEPS steps.
+    MAX_LEARNED_STEPS steps.
 
     Args:
         model: a model whose hypernetwork reads a volume. If it has a learned step, the training continues from that.
@@ -83,7 +83,7 @@ def _gradients(model: HyperPlanes, fitted: LearnedStep, draws: Sequence[Draw], c
     change = written.detach().requires_grad_()
 
     def loss(place: int) -> Tensor:
-        update = started[place][0] + {GRID: change[place]}
+        update = started[place][0] + {GRID_WEIGHT: change[place]}
         return photometric_loss(forward(model, draws[place], update, config)) / len(draws)
 
     total, (found,) = summed_gradients(loss, len(draws), [change])
@@ -99,10 +99,12 @@ def _after_others(
     episode, theta = draw.episode, model.theta.detach()
 
     def inputs() -> tuple[Tensor, Tensor, Tensor]:
-        return step_inputs(model, episode.prepared, theta + update, RAYS, draw.generator, pixels=episode.support_live)
+        return step_inputs(
+            model, episode.prepared, theta + update, GRADIENT_RAYS, draw.generator, pixels=episode.support_live
+        )
 
-    for _ in range(int(torch.randint(STEPS, (), generator=draw.generator))):
+    for _ in range(int(torch.randint(MAX_LEARNED_STEPS, (), generator=draw.generator))):
         read = inputs()
         with torch.no_grad():
-            update = update + {GRID: fitted(*read)[0]}
+            update = update + {GRID_WEIGHT: fitted(*read)[0]}
     return update, inputs()

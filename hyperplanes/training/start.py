@@ -26,7 +26,7 @@ INITIAL = "initial.json"
 """The file, in the folder of a training, that names the checkpoint whose weights it began with."""
 
 ARCHITECTURE = ("target", "network", "hypernetwork", "autoencoder", "coarse_network")
-MOST = 8  # entries of a configuration that a message names
+MAX_NAMED_ENTRIES = 8  # entries of a configuration that a message names
 
 
 def start_training(
@@ -94,7 +94,7 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
         raise ValueError(
             f"checkpoint: expected weights of the configured model, {model.config.method} of the field "
             f"{model.config.target}, got {reference}, {config.method} of the field {config.target}, which differs in "
-            f"{', '.join(differing[:MOST])}{', ...' * (len(differing) > MOST)}; give {known}"
+            f"{', '.join(differing[:MAX_NAMED_ENTRIES])}{', ...' * (len(differing) > MAX_NAMED_ENTRIES)}; give {known}"
         )
     model.load_state_dict(found.state_dict())
     _note(reference, folder)

@@ -10,7 +10,7 @@ from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.context import trained_on
 from hyperplanes.adaptation.correction.stacking import AveragedField
 from hyperplanes.adaptation.fine_tuned import FromScratch
-from hyperplanes.adaptation.fine_tuning import fine_tune_to, made_anyway, make_descent
+from hyperplanes.adaptation.fine_tuning import fine_tune_to, ignoring_no_progress, make_descent
 from hyperplanes.adaptation.optimisation import descent
 from hyperplanes.adaptation.optimisation.descent import split_holdout
 from hyperplanes.adaptation.optimisation.learned_steps import updated_weights
@@ -46,7 +46,8 @@ def test_steps_on_few_views_begin_after_the_learned_ones():
     adapter, still = stepping(), replace(FEW, learning_rate=0.0, muon_learning_rate=0.0)
     for count in (3, MANY_VIEWS):
         support = ball_views(ring(count))
-        made = made_anyway(lambda given=support: adapter.fine_tune(given, 1, still))  # rates of 0 lower no error
+        # rates of 0 lower no error
+        made = ignoring_no_progress(lambda given=support: adapter.fine_tune(given, 1, still))
         one_step = adapter.adapt(support)
         assert torch.equal(made.field.parameters["grid.weight"], one_step.field.parameters["grid.weight"]) == (
             count == 3

@@ -9,10 +9,16 @@ import torch
 
 from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig
 from hyperplanes.adaptation.alignment import canonical_frame
-from hyperplanes.adaptation.alignment.canonical_frame import FEWEST, GAIN, MOST, find_rotation, to_canonical_frame
+from hyperplanes.adaptation.alignment.canonical_frame import (
+    GAIN,
+    MAX_VIEWS,
+    MIN_VIEWS,
+    find_rotation,
+    to_canonical_frame,
+)
 from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.correction.stacking import StackedField
-from hyperplanes.adaptation.fine_tuning import NoProgressError, made_anyway
+from hyperplanes.adaptation.fine_tuning import NoProgressError, ignoring_no_progress
 from hyperplanes.adaptation.optimisation.descent import Descent, split_holdout
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.adaptation.symmetry.reflections import reflected
@@ -167,8 +173,8 @@ def test_objects_without_a_suitable_symmetry_or_number_of_views_are_not_rotated(
     assert found_by(monkeypatch, better, None) == 0
     assert found_by(monkeypatch, better, Symmetry(Plane((0.0, 1.0, 0.0)))) == 0
     assert found_by(monkeypatch, better, replace(ACROSS, order=3)) == 0
-    assert found_by(monkeypatch, better, count=FEWEST - 1) == 0
-    assert found_by(monkeypatch, better, count=MOST + 1) == 0
+    assert found_by(monkeypatch, better, count=MIN_VIEWS - 1) == 0
+    assert found_by(monkeypatch, better, count=MAX_VIEWS + 1) == 0
     assert found_by(monkeypatch, better, azimuth=0.0) == 0
     assert found_by(monkeypatch, better, None, azimuth=1.0) == pytest.approx(math.degrees(1.0))
 
@@ -236,7 +242,7 @@ def test_a_field_with_fixed_planes_refuses_an_azimuth():
 def test_views_that_auto_holds_out_are_rotated_with_the_others(monkeypatch):
     views, settings, seen = balls(cameras(6, SMALL), BODY), FineTuning(rays=16, max_steps=2), []
     monkeypatch.setattr(Descent, "best_stop", lambda self, holdout, **options: seen.append(holdout) or 1)
-    made_anyway(lambda: model(azimuth=ANGLE, symmetry=ACROSS).fine_tune(views, "auto", settings))
+    ignoring_no_progress(lambda: model(azimuth=ANGLE, symmetry=ACROSS).fine_tune(views, "auto", settings))
     _, expected = split_holdout(Rotation(ANGLE).views(views), settings)
     torch.testing.assert_close(seen[0].cameras.extrinsics, expected.cameras.extrinsics)
 
@@ -245,7 +251,7 @@ def test_views_that_auto_holds_out_are_rotated_with_the_others(monkeypatch):
 def test_the_field_of_unsuccessful_steps_is_in_the_frame_of_the_scene(angle, monkeypatch):
     views, settings = balls(cameras(4, SMALL), BODY), FineTuning(rays=16)
     adapter = model(azimuth=angle, symmetry=ACROSS)
-    expected = made_anyway(lambda: adapter.fine_tune(views, 1, settings))
+    expected = ignoring_no_progress(lambda: adapter.fine_tune(views, 1, settings))
     monkeypatch.setattr(Descent, "errors", lambda self: (0.0, 0.0))
     with pytest.raises(NoProgressError) as caught:
         adapter.fine_tune(views, 1, settings)
@@ -265,7 +271,7 @@ def test_a_protocol_applies_to_a_rotated_field(angle):
 
 def test_finding_a_rotation_leaves_the_mode_and_the_weights_of_a_model(monkeypatch):
     """With two threads: the first one to end must not switch the model back to training mode for the other."""
-    monkeypatch.setattr(canonical_frame, "PIXELS", 64)
+    monkeypatch.setattr(canonical_frame, "HELD_OUT_PIXELS", 64)
     views = replace(balls(cameras(2, SMALL), BODY), masks=None)  # without a hull
     adapter, before = HyperPlanes(replace(CONFIG, symmetric=True)).train(), torch.get_num_threads()
     kept = {name: value.clone() for name, value in adapter.state_dict().items()}

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import CorrectedField, HullBlend, HyperPlanes
-from hyperplanes.adaptation.correction.held_out import FEWEST
+from hyperplanes.adaptation.correction.held_out import MIN_VIEWS
 from hyperplanes.adaptation.correction.stacking import AveragedField, StackedField, stack
 from hyperplanes.adaptation.fine_tuning import fine_tune_to
 from hyperplanes.adaptation.gating import GatingNetwork, readings
@@ -70,9 +70,9 @@ def test_a_gate_in_double_precision_gives_the_same_shares():
 
 def test_pixels_are_gated_with_five_or_more_masked_views():
     adapter = HyperPlanes(replace(CONFIG, gated=True))
-    for count in (FEWEST - 1, FEWEST):
+    for count in (MIN_VIEWS - 1, MIN_VIEWS):
         support = ball_views(ring(count, (24, 24)))
-        assert isinstance(adapter.adapt(support), StackedField) == (count == FEWEST)
+        assert isinstance(adapter.adapt(support), StackedField) == (count == MIN_VIEWS)
         assert not isinstance(adapter.adapt(replace(support, masks=None)), StackedField)
 
 
@@ -148,8 +148,8 @@ def test_view_fine_tunes_on_the_same_views_as_render_and_its_fields_do_not_chang
 
 def test_a_fitted_gate_chooses_the_right_picture(monkeypatch):
     # Two pictures of noise: the first is right where its opacity is 1, the second where it is below a half.
-    monkeypatch.setattr(gating, "EXAMPLES", 4)
-    monkeypatch.setattr(gating, "PIXELS", 256)
+    monkeypatch.setattr(gating, "EXAMPLES_PER_STEP", 4)
+    monkeypatch.setattr(gating, "PIXELS_PER_EXAMPLE", 256)
     generator = torch.Generator().manual_seed(0)
     examples = []
     for _ in range(2):

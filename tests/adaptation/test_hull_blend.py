@@ -11,9 +11,9 @@ from hyperplanes.adaptation.base import hull
 from hyperplanes.adaptation.baselines import hull_blend
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry.cameras import camera_from_world, concatenate, with_poses
-from hyperplanes.geometry.chosen_views import ANGLE
+from hyperplanes.geometry.chosen_views import PENALTY_RADIANS
 from hyperplanes.geometry.occupancy import Occupancy, full
-from hyperplanes.geometry.visibility import penalties as against
+from hyperplanes.geometry.visibility import penalties as view_penalties
 from hyperplanes.geometry.visibility.hull_hits import centres_in_hull
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.rendering import RayMarching
@@ -101,7 +101,7 @@ def test_there_is_no_seam_where_an_image_border_cuts_the_object(monkeypatch, com
         return float(column.diff().abs().max())
 
     smooth = steepest()
-    monkeypatch.setattr(against, "CUTTING", 10.0)  # without the treatment of borders
+    monkeypatch.setattr(view_penalties, "MIN_CROPPED_SHARE", 10.0)  # without the treatment of borders
     assert steepest() > 3 * smooth
 
 
@@ -131,7 +131,7 @@ def test_views_without_masks_are_refused():
 
 def test_rendering_the_first_sample_agrees_with_compositing_all(monkeypatch):
     """The kernel, which stops at the first sample, is compared with compositing all samples of an opaque field."""
-    monkeypatch.setattr(hull_blend, "ROUNDING", 0.0)
+    monkeypatch.setattr(hull_blend, "OPACITY_TOLERANCE", 0.0)
     blend = SMALL.adapt(ball_views(ring(7, (24, 24)), colour=(0.9, 0.5, 0.2)))
     cameras = ring(3, (40, 30), shift=1)
     marching = blend.sampling.for_rendering(50)
@@ -190,7 +190,7 @@ def test_points_that_no_view_sees_are_coloured_by_the_nearest_views():
     point, direction = torch.tensor([[0.2, 0.1, 0.0]]), torch.tensor([[0.0, 0.0, -1.0]])
     found, _ = HullBlend(nearest=2, side=32).adapt(support).field(point, direction)
     rays = torch.nn.functional.normalize(point - eyes, dim=1)
-    score, order = (1 * ANGLE + torch.acos((rays * direction).sum(1))).sort()
+    score, order = (1 * PENALTY_RADIANS + torch.acos((rays * direction).sum(1))).sort()
     weights = 1 / score[:2] - 1 / (1.01 * score[2])
     expected = (weights[:, None] * torch.tensor(colours)[order[:2]]).sum(0) / weights.sum()
     torch.testing.assert_close(found[0], expected, atol=1e-2, rtol=0)

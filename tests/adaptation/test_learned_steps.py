@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import HyperPlanes
-from hyperplanes.adaptation.network import GRID
+from hyperplanes.adaptation.network import GRID_WEIGHT
 from hyperplanes.adaptation.optimisation import learned_steps
 from hyperplanes.adaptation.optimisation.learned_steps import PARTS, grid_gradient, take_learned_steps, updated_weights
 from hyperplanes.adaptation.swapped import Swapped
@@ -53,10 +53,10 @@ def test_the_gradient_agrees_with_finite_differences():
     context = adapter.prepare(ball_views(ring(5)))
     weights = adapter.adapted_weights(context)
     error, gradient = error_and_gradient(adapter, context, weights, 512)
-    assert gradient.shape == weights[GRID].shape
+    assert gradient.shape == weights[GRID_WEIGHT].shape
     change = gradient / gradient.norm()
     ahead, behind = (
-        error_and_gradient(adapter, context, weights + {GRID: step * change}, 512)[0] for step in (1e-3, -1e-3)
+        error_and_gradient(adapter, context, weights + {GRID_WEIGHT: step * change}, 512)[0] for step in (1e-3, -1e-3)
     )
     assert (ahead - behind) / 2e-3 == pytest.approx(float(gradient.norm()), rel=1e-3)
     assert error > 0
@@ -90,7 +90,7 @@ def test_steps_lower_the_error_and_are_the_same_each_time():
         for weights in (adapter.adapted_weights(context), first)
     ]
     assert errors[1] < errors[0] - 1e-5
-    assert torch.equal(first[GRID], second[GRID])
+    assert torch.equal(first[GRID_WEIGHT], second[GRID_WEIGHT])
 
 
 @pytest.mark.parametrize(("views", "expected"), [(2, 5), (19, 5), (20, 3), (22, 3)])
@@ -100,7 +100,7 @@ def test_with_many_views_half_as_many_steps_are_taken(views, expected, monkeypat
 
     def no_gradient(adapter, context, weights, *drawn, **options):
         taken.append(1)
-        return torch.zeros_like(weights[GRID])
+        return torch.zeros_like(weights[GRID_WEIGHT])
 
     monkeypatch.setattr(learned_steps, "grid_gradient", no_gradient)
     updated_weights(adapter, context)
@@ -110,7 +110,9 @@ def test_with_many_views_half_as_many_steps_are_taken(views, expected, monkeypat
 def changed(adapter, support, **options):
     """Whether learned steps change the weights of an object."""
     context = adapter.prepare(support, **options)
-    return not torch.equal(updated_weights(adapter, context)[GRID], adapter.adapted_weights(context)[GRID])
+    return not torch.equal(
+        updated_weights(adapter, context)[GRID_WEIGHT], adapter.adapted_weights(context)[GRID_WEIGHT]
+    )
 
 
 def test_there_are_no_learned_steps_for_a_single_view_or_without_masks():
@@ -159,8 +161,8 @@ def test_a_swapped_update_is_followed_by_learned_steps():
     adapter, views = stepping(), [ball_views(ring(4)), ball_views(ring(4), colour=(0.1, 0.3, 0.9), radius=0.4)]
     context = adapter.prepare(views[0])
     foreign = adapter.theta + adapter.update(adapter.prepare(views[1]))
-    expected = take_learned_steps(adapter, context, foreign)[GRID]
-    assert not torch.equal(expected, foreign[GRID])
+    expected = take_learned_steps(adapter, context, foreign)[GRID_WEIGHT]
+    assert not torch.equal(expected, foreign[GRID_WEIGHT])
     swapped = Swapped(adapter, views)
     torch.testing.assert_close(swapped.adapt(views[0]).field.parameters["grid.weight"], expected)
     with torch.inference_mode():  # steps need gradients
@@ -173,8 +175,8 @@ def test_training_gives_a_step_that_improves_query_views_and_does_not_change_the
     before, done = {name: value.clone() for name, value in adapter.state_dict().items()}, []
     with monkeypatch.context() as patch:
         patch.setattr(training, "WARMUP", 1)
-        patch.setattr(training, "STEPS", 2)
-        patch.setattr(training, "RAYS", 128)
+        patch.setattr(training, "MAX_LEARNED_STEPS", 2)
+        patch.setattr(training, "GRADIENT_RAYS", 128)
         patch.setattr(learned_steps, "PARTS", 1)
         fitted = fit_learned_step(adapter, data, config, on_step=lambda step, loss: done.append(step))
     assert done == list(range(1, 15))
@@ -202,7 +204,7 @@ def test_training_starts_from_the_step_of_the_model(monkeypatch):
 def test_training_covers_the_first_four_steps(monkeypatch):
     """The trained step comes after none, one, two or three others."""
     followed, adapter = [], stepping(1)
-    read = (None, None, torch.zeros_like(adapter.theta[GRID])[None])
+    read = (None, None, torch.zeros_like(adapter.theta[GRID_WEIGHT])[None])
     monkeypatch.setattr(training, "step_inputs", lambda *inputs, **options: followed.append(1) or read)
     draw = SimpleNamespace(episode=SimpleNamespace(prepared=None, support_live=None), generator=generator())
     counts = set()

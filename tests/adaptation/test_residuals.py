@@ -110,7 +110,9 @@ def test_corrected_pixels_agree_with_a_loop_over_the_views(name):
     field, support, asked = scene(name)
     plain, found = field.render(asked), ResidualField(field, support).render(asked).images[0]
     own, faint, outside, changed = field.render(support.cameras), 0, 0, 0
-    for row, column in (plain.opacity[0, 0] > residuals.FAINT).nonzero().tolist()[:: 9 if name == "ball" else 6]:
+    for row, column in (
+        (plain.opacity[0, 0] > residuals.MIN_CORRECTED_OPACITY).nonzero().tolist()[:: 9 if name == "ball" else 6]
+    ):
         depth, opacity = (float(each[0, 0, row, column]) for each in (plain.depth, plain.opacity))
         if not depth:
             continue
@@ -122,7 +124,7 @@ def test_corrected_pixels_agree_with_a_loop_over_the_views(name):
             offset = point - camera.centres(one)[0].to(point)
             aside = 1 - float(offset @ ray.directions[0].to(offset) / offset.norm())
             x, y = one.project(point[None].to(one.extrinsics))[0].tolist()
-            if aside >= residuals.WIDEST:
+            if aside >= residuals.MAX_COSINE_DISTANCE:
                 continue
             if not (0 <= x <= SIZE[1] - 1 and 0 <= y <= SIZE[0] - 1):
                 outside += 1
@@ -136,14 +138,20 @@ def test_corrected_pixels_agree_with_a_loop_over_the_views(name):
                 lacking += part * (support.images - own.images)[view, :, at, along]
                 moment += part * float(own.depth[view, 0, at, along] * own.opacity[view, 0, at, along])
                 covered += part * float(own.opacity[view, 0, at, along])
-            apart = (float(offset.norm()) - moment / max(covered, 1e-3)) / (residuals.TOLERANCE * support.bounds.radius)
-            angular = math.exp(-residuals.SHARPNESS * aside) - math.exp(-residuals.SHARPNESS * residuals.WIDEST)
+            apart = (float(offset.norm()) - moment / max(covered, 1e-3)) / (
+                residuals.DISTANCE_SCALE * support.bounds.radius
+            )
+            angular = math.exp(-residuals.ANGULAR_FALLOFF * aside) - math.exp(
+                -residuals.ANGULAR_FALLOFF * residuals.MAX_COSINE_DISTANCE
+            )
             weight = angular * math.exp(-(apart**2))
             total, weights = total + weight * lacking, weights + weight
-        expected = plain.images[0, :, row, column] + min(1, opacity / residuals.SOLID) * total / weights
+        expected = (
+            plain.images[0, :, row, column] + min(1, opacity / residuals.FULL_CORRECTION_OPACITY) * total / weights
+        )
         torch.testing.assert_close(found[:, row, column], expected.clamp(0, 1), atol=1e-3, rtol=0)
         changed += bool((expected - plain.images[0, :, row, column]).abs().max() > 0.05)
-        faint += opacity < 0.8 * residuals.SOLID
+        faint += opacity < 0.8 * residuals.FULL_CORRECTION_OPACITY
     assert changed > 5
     assert name == "ball" or (faint > 5 and outside > 5)
 
@@ -293,7 +301,7 @@ def test_pictures_of_few_or_large_views_or_without_masks_are_not_corrected(many,
     for others in (many[: MANY_VIEWS - 1], replace(many, masks=None)):
         assert not isinstance(model().adapt(others), CorrectedField)
     assert not isinstance(test_stacking.model().adapt(many), CorrectedField)
-    monkeypatch.setattr(residuals, "MOST_PIXELS", MANY_VIEWS * SIZE[0] * SIZE[1] - 1)
+    monkeypatch.setattr(residuals, "MAX_SUPPORT_PIXELS", MANY_VIEWS * SIZE[0] * SIZE[1] - 1)
     assert not isinstance(model().adapt(many), CorrectedField)
 
 

@@ -10,10 +10,10 @@ import torch
 from hyperplanes.adaptation import AdaptedField, HullBlend, HyperPlanes, ModelConfig
 from hyperplanes.adaptation.context import live_pixels
 from hyperplanes.adaptation.correction import held_out, stacking
-from hyperplanes.adaptation.correction.held_out import EVEN, FEWEST, HELD_OUT, PIXELS, hold_out
+from hyperplanes.adaptation.correction.held_out import EVEN, HELD_OUT_PIXELS, MIN_HELD_OUT, MIN_VIEWS, hold_out
 from hyperplanes.adaptation.correction.stacking import (
     CAUTION,
-    MARGIN,
+    MIN_ERROR_REDUCTION,
     StackedField,
     average,
     best_share,
@@ -220,7 +220,7 @@ def test_fields_are_stacked_only_if_the_error_decreases_enough(monkeypatch, othe
     support = ball_views(ring(6, (24, 24)))
     monkeypatch.setattr(held_out.HeldOutPixels, "errors", lambda *_: next(pixels))
     share = (1 / (1 + other**2)) ** CAUTION
-    worth_it = (1 - share) ** 2 + share**2 * other**2 < 1 - MARGIN
+    worth_it = (1 - share) ** 2 + share**2 * other**2 < 1 - MIN_ERROR_REDUCTION
     assert hull_share(hold_out(model(), support)) == pytest.approx(share if worth_it else 0.0)
     assert worth_it == (other < 5)
 
@@ -231,14 +231,14 @@ def test_held_out_pixels_with_contrast_are_the_mean_of_three_rays(monkeypatch, e
     monkeypatch.setattr(held_out, "EVEN", even)
     adapter, support = model(), ball_views(ring(8, (24, 24)))
     order = outermost_first(support.camera_directions, len(support))
-    held = support[order[-HELD_OUT:]]
+    held = support[order[-MIN_HELD_OUT:]]
     trial = hold_out(adapter, support)
     among, generators = live_pixels(trial.context.occupancy, held), [torch.Generator().manual_seed(0) for _ in range(2)]
-    rays, truth, _ = held.sample_masked_rays(PIXELS, generator=generators[0], among=among, subpixels=SUBPIXELS)
-    chosen = among[torch.randint(len(among), (PIXELS,), generator=generators[1])]
+    rays, truth, _ = held.sample_masked_rays(HELD_OUT_PIXELS, generator=generators[0], among=among, subpixels=SUBPIXELS)
+    chosen = among[torch.randint(len(among), (HELD_OUT_PIXELS,), generator=generators[1])]
     finer, field = trial.learned.sampling.for_rendering(trial.pixels.across), trial.learned
     found = render(field.field, rays, finer, occupancy=field.occupancy, differentiable=False)
-    three, one = found.pooled(3).colour, found.colour[:PIXELS]
+    three, one = found.pooled(3).colour, found.colour[:HELD_OUT_PIXELS]
     uneven = contrast(held.images).flatten()[chosen] > even
     assert len(trial.pixels.even) == int((~uneven).sum())
     assert len(trial.pixels.uneven) == 3 * int(uneven.sum())
@@ -251,7 +251,7 @@ def test_held_out_pixels_with_contrast_are_the_mean_of_three_rays(monkeypatch, e
 
 def test_few_views_or_views_without_masks_give_no_share():
     adapter = model()
-    for count in (1, FEWEST - 1):
+    for count in (1, MIN_VIEWS - 1):
         assert hull_share(hold_out(adapter, ball_views(ring(count, (24, 24))))) == 0
     support = ball_views(ring(6, (24, 24)))
     assert hull_share(hold_out(model(empty=True), replace(support, masks=None))) == 0

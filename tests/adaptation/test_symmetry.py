@@ -14,18 +14,23 @@ from hyperplanes.adaptation.alignment import finding_symmetry
 from hyperplanes.adaptation.alignment.rotation import Rotation
 from hyperplanes.adaptation.base import hull
 from hyperplanes.adaptation.fine_tuned import FromScratch
-from hyperplanes.adaptation.fine_tuning import made_anyway
+from hyperplanes.adaptation.fine_tuning import ignoring_no_progress
 from hyperplanes.adaptation.symmetry import detection as symmetry
 from hyperplanes.adaptation.symmetry import judging as judging_symmetry
 from hyperplanes.adaptation.symmetry import reflections
-from hyperplanes.adaptation.symmetry.detection import AXES, ReflectedHullBlend, possible_symmetries, symmetry_of
+from hyperplanes.adaptation.symmetry.detection import (
+    PRINCIPAL_NORMALS,
+    ReflectedHullBlend,
+    possible_symmetries,
+    symmetry_of,
+)
 from hyperplanes.adaptation.symmetry.judging import SymmetryJudge, carved
 from hyperplanes.adaptation.symmetry.reflections import (
-    HANDICAP,
-    ROTATED,
-    UNKNOWN,
-    handicaps,
+    OTHER_PLANE_PENALTY,
+    REFLECTION_PENALTY,
+    UNKNOWN_OPACITY,
     images_by,
+    penalty_offsets,
     reflected,
     with_reflections,
 )
@@ -120,7 +125,9 @@ def coarse(monkeypatch):
 @pytest.fixture
 def across_alone(monkeypatch):
     """Do not search for planes of other azimuths."""
-    monkeypatch.setattr(symmetry, "best_vertical_plane", lambda judge, views: Plane.of_sphere(views.bounds, AXES[0]))
+    monkeypatch.setattr(
+        symmetry, "best_vertical_plane", lambda judge, views: Plane.of_sphere(views.bounds, PRINCIPAL_NORMALS[0])
+    )
 
 
 @pytest.mark.usefixtures("across_alone", "coarse")
@@ -243,7 +250,7 @@ def test_the_number_of_planes_of_a_solid_of_revolution_is_limited_by_the_number_
 @pytest.mark.usefixtures("coarse")
 def test_the_number_of_planes_is_limited_by_the_number_of_pixels(monkeypatch):
     views = balls(cameras(2, SMOOTH), REVOLVED)
-    monkeypatch.setattr(judging_symmetry, "MOST_PIXELS", 13 * views.images[:, 0].numel())
+    monkeypatch.setattr(judging_symmetry, "MAX_REFLECTED_PIXELS", 13 * views.images[:, 0].numel())
     assert symmetry_of(views).order == 6
 
 
@@ -271,7 +278,9 @@ def test_reflected_and_rotated_views_show_the_same_object():
     assert len(found) == 2 * symmetry.images
     truth = balls(found.cameras, around(3, [RED]))
     assert ((found.images - truth.images).abs().amax(1) < 1e-5).float().mean() > 0.999
-    assert handicaps(2, symmetry).tolist() == pytest.approx([0.0] * 2 + [HANDICAP] * 2 + [ROTATED] * 8)
+    assert penalty_offsets(2, symmetry).tolist() == pytest.approx(
+        [0.0] * 2 + [REFLECTION_PENALTY] * 2 + [OTHER_PLANE_PENALTY] * 8
+    )
 
 
 def test_the_context_of_a_model_separates_given_views_from_reflections():
@@ -316,7 +325,7 @@ def test_an_asymmetric_part_is_in_the_hull_only_at_its_place():
     carelessly = hull(join_views(views, reflected(views, ACROSS.plane)), 64)
     both = with_reflections(views, ACROSS)
     assert torch.equal(both.masks[: len(views)], views.masks)
-    assert (both.masks[len(views) :] == UNKNOWN).any()
+    assert (both.masks[len(views) :] == UNKNOWN_OPACITY).any()
     carefully = hull(both, 64)
     assert not carelessly.contains(own)
     assert carefully.contains(own)
@@ -326,7 +335,7 @@ def test_an_asymmetric_part_is_in_the_hull_only_at_its_place():
 def test_reflections_of_a_symmetric_object_have_no_unknown_pixels():
     views = balls(cameras(8), BODY)
     found = with_reflections(views, ACROSS)
-    assert not (found.masks == UNKNOWN).any()
+    assert not (found.masks == UNKNOWN_OPACITY).any()
     torch.testing.assert_close(found.images, torch.cat([views.images, views.images.flip(3)]))
 
 
@@ -345,10 +354,10 @@ def test_the_hull_of_views_and_reflections_prefers_views():
     along = torch.tensor([[0.0, -1.0, 0.0]]).expand(300, 3)
     seen = planes.choose(points, along, best=1, nearest=len(planes)).nearest
     assert seen.penalty[seen.views < len(views)].min() == 0
-    assert seen.penalty[seen.views >= len(views)].min() == pytest.approx(HANDICAP)
+    assert seen.penalty[seen.views >= len(views)].min() == pytest.approx(REFLECTION_PENALTY)
 
 
-def test_a_model_uses_reflections_as_views_with_a_handicap():
+def test_a_model_uses_reflections_as_views_with_a_penalty_offset():
     views = balls(cameras(), BODY)
     symmetric, plain = model(), model()
     plain.config = replace(plain.config, symmetric=False)
@@ -360,12 +369,12 @@ def test_a_model_uses_reflections_as_views_with_a_handicap():
     assert len(plain.prepare(views).planes) == 4
     points = torch.tensor([[0.0, 0.0, 0.4], [0.3, 0.35, 0.0]])
     found = context.planes.choose(points, best=8).best
-    without = context.planes.with_handicaps(torch.zeros(8)).choose(points, best=8).best
+    without = context.planes.with_penalty_offsets(torch.zeros(8)).choose(points, best=8).best
     for row in range(2):
         costs = dict(zip(found.views[row].tolist(), found.penalty[row].tolist(), strict=True))
         plainly = dict(zip(without.views[row].tolist(), without.penalty[row].tolist(), strict=True))
         for view in range(8):
-            assert costs[view] == pytest.approx(plainly[view] + (HANDICAP if view >= 4 else 0), abs=1e-5)
+            assert costs[view] == pytest.approx(plainly[view] + (REFLECTION_PENALTY if view >= 4 else 0), abs=1e-5)
 
 
 @pytest.mark.usefixtures("coarse")
@@ -400,7 +409,7 @@ TUNING = FineTuning(rays=64, learning_rate=1e-3, muon_learning_rate=1e-3)
 def test_gradient_steps_draw_rays_of_reflections_except_at_unknown_pixels(drawn):
     model(symmetry=ACROSS, azimuth=0.0).fine_tune(balls(cameras(8), [*BODY, ANTENNA]), 2, TUNING)
     assert [count for count, _ in drawn].count(16) >= 2
-    assert not any((opacity == UNKNOWN).any() for _, opacity in drawn)
+    assert not any((opacity == UNKNOWN_OPACITY).any() for _, opacity in drawn)
 
 
 def test_gradient_steps_draw_no_rays_of_reflections_about_further_planes(drawn):
@@ -416,11 +425,11 @@ def test_gradient_steps_draw_rays_of_reflections_only_with_few_views(drawn, give
     assert {count for count, _ in drawn} == {shown}
 
 
-def test_kernels_and_pytorch_choose_the_same_views_with_handicaps(monkeypatch):
+def test_kernels_and_pytorch_choose_the_same_views_with_penalty_offsets(monkeypatch):
     from hyperplanes.geometry.visibility import planes as module
 
     views = ball_views(ring(3, (20, 24)))
-    planes = HullBlend().adapt(views).field.planes.with_handicaps(torch.tensor([0.0, 0.3, 0.1]))
+    planes = HullBlend().adapt(views).field.planes.with_penalty_offsets(torch.tensor([0.0, 0.3, 0.1]))
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     along = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     compiled = planes.choose(points, along, best=3, nearest=2)
@@ -556,7 +565,7 @@ def test_random_weights_use_the_symmetry_that_the_model_finds(monkeypatch, plane
     adapter = model()
     monkeypatch.setattr(adapter, "find_symmetry", lambda support: plane)
     settings = FineTuning(rays=16, learning_rate=1e-4, muon_learning_rate=1e-4)
-    made = made_anyway(lambda: FromScratch(adapter, 1, settings).adapt(balls(cameras(4, SMALL), BODY)))
+    made = ignoring_no_progress(lambda: FromScratch(adapter, 1, settings).adapt(balls(cameras(4, SMALL), BODY)))
     assert made.symmetry == plane
 
 

@@ -21,8 +21,8 @@ VIEWS = 9
 def coarse():
     """Use hulls with fewer voxels to compare masks."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(consistency, "COARSE", 40)
-        patch.setattr(consistency, "FINE", 60)
+        patch.setattr(consistency, "COARSE_SIDE", 40)
+        patch.setattr(consistency, "FINE_SIDE", 60)
         yield
 
 

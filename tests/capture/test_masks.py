@@ -95,8 +95,8 @@ def test_the_network_finds_a_salient_object():
 @pytest.fixture
 def coarse(monkeypatch):
     """Use hulls with fewer voxels."""
-    monkeypatch.setattr(consistency, "COARSE", 48)
-    monkeypatch.setattr(consistency, "FINE", 96)
+    monkeypatch.setattr(consistency, "COARSE_SIDE", 48)
+    monkeypatch.setattr(consistency, "FINE_SIDE", 96)
 
 
 @pytest.fixture(scope="module")
@@ -119,8 +119,8 @@ def ball_seen():
 
 
 def test_consistent_masks_are_not_changed(ball_seen, monkeypatch):
-    monkeypatch.setattr(consistency, "COARSE", 40)
-    monkeypatch.setattr(consistency, "FINE", 72)
+    monkeypatch.setattr(consistency, "COARSE_SIDE", 40)
+    monkeypatch.setattr(consistency, "FINE_SIDE", 72)
     model, sphere, masks = ball_seen
     found = consistency.agree(masks, model, sphere)
     assert (found.votes, found.wrong) == (1, [])

@@ -35,7 +35,7 @@ def views():
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
     monkeypatch.setattr(pose_refinement, "LEVELS", ((32, 16, 60), (64, 24, 60)))
-    monkeypatch.setattr(pose_refinement, "RAYS", 256)
+    monkeypatch.setattr(pose_refinement, "RAYS_PER_STEP", 256)
     monkeypatch.setattr(pose_refinement, "FIXED", 0)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
-from hyperplanes.commands.inputs.disk_cache import MOST, keep_field, kept_folder, recall_field
+from hyperplanes.commands.inputs.disk_cache import MAX_ENTRIES, keep_field, kept_folder, recall_field
 from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.views import Views
@@ -64,7 +64,7 @@ def test_the_folder_depends_on_views_steps_and_options(model, views):
 def test_the_oldest_fields_are_removed(model, views, field, tmp_path):
     """The times of the folders are in another order than their names."""
     folder = kept_folder(model, views, 0, FineTuning())
-    names = [f"old{number}" for number in range(MOST)]
+    names = [f"old{number}" for number in range(MAX_ENTRIES)]
     for age, name in enumerate(names[4:] + names[:4]):
         (tmp_path / "adapted" / name).mkdir(parents=True)
         os.utime(tmp_path / "adapted" / name, (1000.0 + age, 1000.0 + age))

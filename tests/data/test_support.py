@@ -7,7 +7,14 @@ import torch
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.data.devices import TasksOnDevice
-from hyperplanes.data.support import FewerQueries, Inputs, Shown, SingleView, WithBounds, WithSupport
+from hyperplanes.data.support import (
+    FarthestSupport,
+    FewerQueries,
+    SingleView,
+    SupportByPosition,
+    WithBounds,
+    WithSupport,
+)
 from hyperplanes.evaluation import evaluate
 from hyperplanes.fields import TargetConfig
 from hyperplanes.geometry.cameras import centres
@@ -91,15 +98,15 @@ def test_inputs_are_numbered_in_the_order_of_their_names(named):
 
     before = Alternating().task("test0")
     expected = (before.support, 0), (before.query, 1 if named else 3)
-    after = Inputs(Alternating(), (0, 3 if named else 7)).task("test0")
+    after = SupportByPosition(Alternating(), (0, 3 if named else 7)).task("test0")
     for got, (views, place) in zip(after.support.images, expected, strict=True):
         assert torch.equal(got, views.images[place])
     assert len(after.query) == 6
     with pytest.raises(ValueError, match="test0: expected inputs from 0 to 7, got 8; name other views"):
-        Inputs(Alternating(), (8,)).task("test0")
+        SupportByPosition(Alternating(), (8,)).task("test0")
     for wrong in ((), (1, 1), (-1,)):
         with pytest.raises(ValueError, match="inputs: expected different positions of views, from 0, got"):
-            Inputs(Alternating(), wrong)
+            SupportByPosition(Alternating(), wrong)
 
 
 def test_inputs_are_numbered_by_the_numbers_in_their_names():
@@ -164,8 +171,8 @@ def test_every_wrapper_keeps_splits_and_classes():
     for wrapped in (
         WithSupport(data, 2),
         SingleView(data),
-        Shown(data, 2, 1),
-        Inputs(data, (0,)),
+        FarthestSupport(data, 2, 1),
+        SupportByPosition(data, (0,)),
         FewerQueries(data, 1),
         TasksOnDevice(data, torch.device("cpu")),
     ):

@@ -253,8 +253,8 @@ def test_several_seeds_are_several_trainings(out, given):
 
 
 def test_an_estimate_counts_every_seed(out, given, monkeypatch, capsys):
-    monkeypatch.setattr(estimate, "STEPS", 1)
-    monkeypatch.setattr(estimate, "SIDE", 8)
+    monkeypatch.setattr(estimate, "MEASURED_STEPS", 1)
+    monkeypatch.setattr(estimate, "MEASURED_VIEW_SIZE", 8)
     command = ["reproduce", "shapenet", "--scale", "smoke", "--estimate", "--out", str(out), *given]
     assert main([*command, "--seeds", "3"]) == 0
     shown = capsys.readouterr().out

@@ -17,7 +17,7 @@ from small_packaged import small_packaged
 
 from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.checkpoints import packaged_folder
-from hyperplanes.data.support import Shown
+from hyperplanes.data.support import FarthestSupport
 from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.experiments.demonstration.settings import DemoSettings
 from hyperplanes.experiments.demonstration.steps import Demonstration
@@ -215,7 +215,7 @@ def test_the_first_page_uses_the_packaged_model_even_if_a_folder_has_its_name(tm
     baselines = ["the nearest support view, copied (3 views)", "support views blended on the visual hull (3 views)"]
     assert rows == [*baselines, "3 views", "the first page"]
     frames = sorted((tmp_path / "first/pictures/car/views_3/test0/orbit").iterdir())
-    support = Shown(balls, 3, 2).task("test0").support
+    support = FarthestSupport(balls, 3, 2).task("test0").support
     found = to_pixels(model.adapt(support).render(orbit_cameras(support, 2)).images)
     read = np.stack([np.asarray(Image.open(frame).convert("RGB")) for frame in frames])
     assert np.abs(read.astype(int) - found).max() <= 1

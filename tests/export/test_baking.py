@@ -19,7 +19,7 @@ from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, cast
 from hyperplanes.rendering.renderer import RayMarching, render
 from hyperplanes.rendering.transmittance import transmittance
-from hyperplanes.rendering.voxels import STOP, VoxelGrid, distance_to_filled, render_voxels, shade_voxels
+from hyperplanes.rendering.voxels import STOP_TRANSMITTANCE, VoxelGrid, distance_to_filled, render_voxels, shade_voxels
 from hyperplanes.utilities.files.checkpoints import CheckpointError
 from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
@@ -76,9 +76,9 @@ def test_harmonics_are_orthonormal():
 
 
 def test_baked_pictures_have_more_rays_at_edges(baked, monkeypatch):
-    monkeypatch.setattr(baking, "EDGE", 0.2)  # the ball is soft
+    monkeypatch.setattr(baking, "BAKED_EDGE_THRESHOLD", 0.2)  # the ball is soft
     found = BakedScene(baked).render(CAMERAS)
-    monkeypatch.setattr(baking, "EDGE", math.inf)
+    monkeypatch.setattr(baking, "BAKED_EDGE_THRESHOLD", math.inf)
     plain = BakedScene(baked).render(CAMERAS)
     assert found.samples > plain.samples
     assert not torch.equal(found.opacity, plain.opacity)
@@ -96,7 +96,7 @@ def test_baked_pictures_agree_with_the_field(seen, baked):
 def test_the_compiled_caster_agrees_with_packed_torch(baked):
     # Source of truth: the same voxels as a field in the generic renderer, with the same steps.
     scene = BakedScene(baked)
-    sampling, cameras = RayMarching(scene.steps, STOP), camera.select(CAMERAS, [2, 5])
+    sampling, cameras = RayMarching(scene.steps, STOP_TRANSMITTANCE), camera.select(CAMERAS, [2, 5])
     generic = render(baked, cameras, sampling, bounds=baked.occupancy.bounds, occupancy=baked.occupancy)
     compiled = scene.render(cameras)
     assert float((generic.images - compiled.images).abs().max()) < 5e-3
@@ -285,8 +285,8 @@ def test_fitting_with_several_rays_per_edge_pixel_is_better_than_with_one(monkey
     )
     whole, found = bake(ball, side=48), []
     shown, truth = (_means_of_areas(ball, count) for count in (6, 2))
-    for edge in (voxel_fitting.EDGE, math.inf):
-        monkeypatch.setattr(voxel_fitting, "EDGE", edge)
+    for edge in (voxel_fitting.EDGE_THRESHOLD, math.inf):
+        monkeypatch.setattr(voxel_fitting, "EDGE_THRESHOLD", edge)
         fitted = fit_voxels(whole, shown, steps=40, pixels=1024)
         found.append(quality_of(fitted, truth))
     assert found[0] > found[1] + 1

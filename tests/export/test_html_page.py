@@ -17,7 +17,7 @@ from PIL import Image
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.export.baking import BakedScene, bake
 from hyperplanes.export.images import encode_animation, to_pixels
-from hyperplanes.export.page import AROUND, address_of, page_of, save_page, turning_picture
+from hyperplanes.export.page import PAGE_FRAME_BYTES, address_of, page_of, save_page, turning_picture
 from hyperplanes.geometry import Sphere
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
@@ -258,7 +258,7 @@ def test_a_typed_camera_address_is_used_only_if_it_is_valid(small, tmp_path):
 
 
 def test_a_page_is_one_file_without_external_resources(coarse, views, tmp_path, monkeypatch):
-    monkeypatch.setattr("hyperplanes.export.page.SIZE", 32)
+    monkeypatch.setattr("hyperplanes.export.page.TURNTABLE_SIZE", 32)
     picture = turning_picture(coarse, views)
     text = save_page(page_of(coarse, views, picture=picture), tmp_path / "page.html", "Two <balls>").read_text()
     assert "<title>Two &lt;balls&gt;</title>" in text
@@ -274,6 +274,6 @@ def test_a_too_large_page_is_written_with_less_precision_or_refused(coarse, view
     smaller = page_of(coarse, views, picture=picture, largest=limit)
     assert len(smaller.encode()) <= limit
     assert len(page_of(coarse, views, picture=picture, largest=int(0.8 * whole))) < 0.8 * whole
-    assert save_page(smaller, tmp_path / "page.html", 255 * '"').stat().st_size <= limit + AROUND
+    assert save_page(smaller, tmp_path / "page.html", 255 * '"').stat().st_size <= limit + PAGE_FRAME_BYTES
     with pytest.raises(ValueError, match=r"page: expected at most 0.001 MB, got .* and a picture of 0.004 MB"):
         page_of(coarse, views, picture=picture, largest=1000)

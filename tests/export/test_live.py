@@ -61,7 +61,7 @@ def test_a_page_without_a_size_has_no_camera(fov, aspect):
 
 def test_a_very_wide_page_gets_a_picture_of_bounded_width():
     height, width = camera.image_size(viewed_camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 0.7, 100.0, 1024))
-    assert width <= live.WIDEST
+    assert width <= live.MAX_WIDTH
     assert width / height == pytest.approx(100, rel=0.02)
 
 

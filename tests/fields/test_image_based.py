@@ -164,7 +164,7 @@ def test_the_kernel_computes_the_same_inputs_as_pytorch(count, grid, monkeypatch
     smaller = Occupancy(occupancy.occupied & ~occupancy.surface().occupied, occupancy.bounds)
     judged = replace(field, planes=field.planes.with_surface(smaller))
     close = bound(target, coloured(count, distance=1.2), parameters)
-    close = replace(close, planes=close.planes.with_handicaps(torch.linspace(0, 0.1, count)))
+    close = replace(close, planes=close.planes.with_penalty_offsets(torch.linspace(0, 0.1, count)))
 
     def outputs():
         for each in (field, hiding, judged, close):

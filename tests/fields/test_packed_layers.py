@@ -155,7 +155,7 @@ def test_nan_of_a_point_does_not_spread_to_others():
     [(63, torch.float32), (80, torch.float32), (None, torch.float32), (64, torch.float64)],
 )
 def test_other_widths_and_precisions_are_left_to_pytorch(module, width, dtype):
-    width = width or import_module(f"hyperplanes.geometry.kernels.{module}").WIDEST + 64
+    width = width or import_module(f"hyperplanes.geometry.kernels.{module}").MAX_LAYER_WIDTH + 64
     layers = [(weight.to(dtype), bias.to(dtype)) for weight, bias in layers_of(2, width, 5, 1)]
     assert PackedLayers.of(layers, 1) is None
 

@@ -14,7 +14,7 @@ from numba.core.dispatcher import Dispatcher
 
 from hyperplanes.geometry import ImagePlanes, cameras, kernels
 from hyperplanes.geometry.kernels import threads
-from hyperplanes.geometry.kernels.threads import at_once, parallel_for, parallel_map
+from hyperplanes.geometry.kernels.threads import parallel_for, parallel_map, run_concurrently
 
 PREFIX = "hyperplanes.geometry.kernels."
 
@@ -84,25 +84,28 @@ def test_two_computations_run_concurrently(three_threads):
         return name, sum(parallel_map(lambda part: part, range(5))), torch.is_grad_enabled()
 
     with torch.no_grad():
-        assert at_once(lambda: work("one"), lambda: work("other"), CPU) == (("one", 10, False), ("other", 10, False))
+        assert run_concurrently(lambda: work("one"), lambda: work("other"), CPU) == (
+            ("one", 10, False),
+            ("other", 10, False),
+        )
 
 
 def test_two_computations_run_in_turn_with_one_thread_or_where_two_run_already(three_threads):
     def ran():
         return threading.get_ident()
 
-    inner = at_once(lambda: at_once(ran, ran, CPU), ran, CPU)
+    inner = run_concurrently(lambda: run_concurrently(ran, ran, CPU), ran, CPU)
     assert inner[0] == (ran(), ran())
     assert inner[1] != ran()
-    assert at_once(ran, ran, torch.device("meta")) == (ran(), ran())
+    assert run_concurrently(ran, ran, torch.device("meta")) == (ran(), ran())
     torch.set_num_threads(1)
-    assert at_once(ran, ran, CPU) == (ran(), ran())
+    assert run_concurrently(ran, ran, CPU) == (ran(), ran())
 
 
 @pytest.mark.parametrize("count", [2, 5, 3])
 def test_both_of_two_computations_have_the_number_of_threads_that_is_set(count, three_threads):
     torch.set_num_threads(count)
-    state = at_once(*2 * [lambda: (torch.get_num_threads(), torch.is_grad_enabled())], CPU)
+    state = run_concurrently(*2 * [lambda: (torch.get_num_threads(), torch.is_grad_enabled())], CPU)
     assert state == ((count, False), (count, False))
     assert torch.get_num_threads() == count
     assert torch.is_grad_enabled()
@@ -119,9 +122,9 @@ def test_an_error_in_one_of_two_computations_is_raised_when_both_have_ended(wron
             raise ValueError(name)
 
     with pytest.raises(ValueError, match=wrong):
-        at_once(lambda: work("one"), lambda: work("other"), CPU)
+        run_concurrently(lambda: work("one"), lambda: work("other"), CPU)
     assert sorted(ended) == ["one", "other"]
-    assert at_once(lambda: 1, lambda: 2, CPU) == (1, 2)
+    assert run_concurrently(lambda: 1, lambda: 2, CPU) == (1, 2)
 
 
 @pytest.mark.parametrize(("size", "exact"), [(8, False), (8, True), (150, True)])

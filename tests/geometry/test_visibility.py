@@ -12,14 +12,14 @@ from hyperplanes.adaptation.baselines.hull_blend import blend_views
 from hyperplanes.geometry import Sphere, carve, cast
 from hyperplanes.geometry.cameras import centres, concatenate, projection_matrices
 from hyperplanes.geometry.chosen_views import (
-    ANGLE,
-    BEYOND,
-    CUT,
-    DEEPEST,
-    MARGIN,
-    PARTLY,
-    UNSEEN,
-    WHOLE,
+    BORDER_MARGIN,
+    BORDER_PENALTY,
+    BORDER_POLE,
+    INVISIBLE_PENALTY,
+    MAX_DEPTH_PENALTY,
+    OPAQUE_MASK,
+    PARTIAL_MASK_PENALTY,
+    PENALTY_RADIANS,
     Penalties,
 )
 from hyperplanes.geometry.distortion import distorted, distorted_pixels
@@ -112,7 +112,7 @@ def slow_penalties(shown, points, hidden=()):
             u, v, w = (matrices[view] @ torch.cat([point, torch.ones(1)])).tolist()
             inside = w > 1e-3 and -0.01 <= u / w <= width - 0.99 and -0.01 <= v / w <= height - 0.99
             if not inside or view in hidden:
-                rows.append([*direction.tolist(), 0.0, 1.0, UNSEEN])
+                rows.append([*direction.tolist(), 0.0, 1.0, INVISIBLE_PENALTY])
                 continue
             u, v = min(max(u / w, 0), width - 1), min(max(v / w, 0), height - 1)
             column, row = min(int(u), width - 2), min(int(v), height - 2)
@@ -121,10 +121,12 @@ def slow_penalties(shown, points, hidden=()):
             low = corners[1, 0] * (1 - u + column) + corners[1, 1] * (u - column)
             depth, opacity = (top * (1 - v + row) + low * (v - row)).tolist()
             behind = distance - depth
-            penalty = min(max(behind - shown.tolerance, -DEEPEST), DEEPEST) + (PARTLY if opacity < WHOLE else 0)
-            cut = 1 - (height - 1 - v) / (MARGIN * height)
+            penalty = min(max(behind - shown.tolerance, -MAX_DEPTH_PENALTY), MAX_DEPTH_PENALTY) + (
+                PARTIAL_MASK_PENALTY if opacity < OPAQUE_MASK else 0
+            )
+            cut = 1 - (height - 1 - v) / (BORDER_MARGIN * height)
             if view == len(shown) - 1 and cut > 0:
-                penalty = max(penalty, 0) + CUT * cut / (BEYOND - cut)
+                penalty = max(penalty, 0) + BORDER_PENALTY * cut / (BORDER_POLE - cut)
             rows.append([*direction.tolist(), behind, opacity, penalty])
     return torch.tensor(rows).reshape(len(points), len(shown), 6)
 
@@ -137,7 +139,7 @@ def test_the_chosen_views_are_those_of_the_definition(monkeypatch, compiled):
     found = shown.choose(points, directions, best=3, nearest=2)
     every = slow_penalties(shown, points, hidden=(2,))
     angle = torch.acos((every[..., :3] * directions[:, None]).sum(-1).clamp(-1, 1))
-    score = angle + ANGLE * every[..., 5].clamp_min(0)
+    score = angle + PENALTY_RADIANS * every[..., 5].clamp_min(0)
     for chosen, order in ((found.best, every[..., 5]), (found.nearest, score)):
         values = torch.cat([chosen.directions, torch.stack([chosen.behind, chosen.coverage, chosen.penalty], -1)], -1)
         torch.testing.assert_close(
@@ -146,7 +148,7 @@ def test_the_chosen_views_are_those_of_the_definition(monkeypatch, compiled):
         assert all(len(set(row)) == 3 for row in chosen.views.tolist())  # three different views
         least = order.sort(1).values[:, :3]
         torch.testing.assert_close(order.gather(1, chosen.views), least, atol=1e-4, rtol=0)
-    unseen = every[..., 5] == UNSEEN
+    unseen = every[..., 5] == INVISIBLE_PENALTY
     assert unseen[:, 2].all()
     assert 0.2 < unseen.float().mean() < 0.8  # some are seen, some are not
     torch.testing.assert_close(found.coverage, every[..., 4].amin(1), atol=1e-5, rtol=0)
@@ -157,17 +159,17 @@ def test_the_chosen_views_are_those_of_the_definition(monkeypatch, compiled):
 @pytest.mark.parametrize("compiled", [True, False])
 def test_where_penalties_are_equal_occlusion_decides_alike(monkeypatch, compiled):
     """Points of the surface that each view sees, and that other views see, see from behind or see at an edge."""
-    handicaps = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4])
-    shown = planes(ring(5, SIZE)).with_handicaps(handicaps)
+    offsets = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4])
+    shown = planes(ring(5, SIZE)).with_penalty_offsets(offsets)
     if not compiled:
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     view, row, column = (shown.depth_opacity[..., 1] == 1).nonzero().unbind(1)
     pixels = torch.stack([column, row], 1).float()
     points = cast(shown.colours.cameras, view, pixels, Sphere()).at(shown.depth_opacity[view, row, column, :1])[:, 0]
-    seen = shown.with_penalties(Penalties.alike()).choose(points, best=len(shown)).best
-    hidden, valid = (seen.behind > shown.tolerance) | (seen.coverage < WHOLE), seen.penalty < UNSEEN
+    seen = shown.with_penalties(Penalties.binary()).choose(points, best=len(shown)).best
+    hidden, valid = (seen.behind > shown.tolerance) | (seen.coverage < OPAQUE_MASK), seen.penalty < INVISIBLE_PENALTY
     assert 0.1 < hidden[valid].float().mean() < 0.9  # some are hidden, some are not
-    expected = hidden.float() + handicaps[seen.views]
+    expected = hidden.float() + offsets[seen.views]
     clear = (seen.behind - shown.tolerance).abs() > 1e-5
     torch.testing.assert_close(seen.penalty[valid & clear], expected[valid & clear])
 
@@ -179,7 +181,7 @@ def test_blended_colours_are_those_of_the_unstructured_lumigraph(monkeypatch, co
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     every = slow_penalties(shown, points)
     angle = torch.acos((every[..., :3] * directions[:, None]).sum(-1).clamp(-1, 1))
-    score, order = (angle + ANGLE * every[..., 5].clamp_min(0)).clamp_min(1e-2).sort(1)
+    score, order = (angle + PENALTY_RADIANS * every[..., 5].clamp_min(0)).clamp_min(1e-2).sort(1)
     weights = (1 / score[:, :2] - 1 / (1.01 * score[:, 2:3])).clamp_min(1e-6)
     colours = shown.colours.lookup(points).colours.gather(1, order[:, :2, None].expand(-1, -1, 3))
     expected = (weights[..., None] * colours).sum(1) / weights.sum(1, keepdim=True)
@@ -198,15 +200,15 @@ def test_a_border_cuts_an_object_if_enough_of_its_pixels_are_set():
     cut = torch.tensor(
         [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 1], [1, 1, 1, 1]]
     )
-    torch.testing.assert_close(margins(masks), MARGIN * 40 * cut)
+    torch.testing.assert_close(margins(masks), BORDER_MARGIN * 40 * cut)
     large = torch.zeros(2, 1, 200, 400)
     large[0, 0, 0, :3], large[1, 0, 0, :4] = 1, 1
-    torch.testing.assert_close(margins(large), MARGIN * 200 * torch.tensor([[0, 0, 0, 0], [0, 0, 1, 0]]))
+    torch.testing.assert_close(margins(large), BORDER_MARGIN * 200 * torch.tensor([[0, 0, 0, 0], [0, 0, 1, 0]]))
 
 
 def test_penalties_grow_over_the_margins_of_borders_that_cut_the_object():
     """By hand, for 41 x 61 pixels: at the left border, halfway, beyond the margin, at the lower and right borders."""
-    margin = MARGIN * 41
+    margin = BORDER_MARGIN * 41
     pixels = torch.tensor([[0.0, 20.0], [margin / 2, 20.0], [margin + 1, 20.0], [30.0, 40.0], [60.0, 20.0]])
     coordinates = (pixels / torch.tensor([60.0, 40.0]) * 2 - 1)[:, None].expand(-1, 2, 2)
     found = fading(torch.tensor([[margin, 0, 0, margin], [0, 0, 0, 0]]), coordinates, (41, 61))
@@ -221,18 +223,18 @@ def test_the_margin_is_measured_where_the_lens_shows_a_point():
     views, (points, _) = ball_views(cameras), queries(500)
     given = views.images, views.cameras, views.masks, ball()
     fading_out, whole = VisibilityPlanes(*given), VisibilityPlanes(*given)
-    whole._against = replace(whole._against, margins=torch.zeros_like(whole._against.margins))
+    whole._view_penalties = replace(whole._view_penalties, margins=torch.zeros_like(whole._view_penalties.margins))
     found, plain = (_penalties_of(each.choose(points, best=5).best, 4) for each in (fading_out, whole))
     # by hand: the row in which the lens shows the point, and its position in the margin of the lower border
     matrix = projection_matrices(pinholes)[4]
     ideal = points @ matrix[:, :3].T + matrix[:, 3]
     ideal = (ideal[:, :2] / ideal[:, 2:])[:, None].expand(-1, 5, -1)
     row = distorted_pixels(cameras, ideal)[0][:, 4, 1].clamp(0, SIZE[0] - 1)
-    cut = 1 - (SIZE[0] - 1 - row) / (MARGIN * SIZE[0])
-    expected = torch.where(cut > 0, plain.clamp_min(0) + CUT * cut / (BEYOND - cut), plain)
-    expected = torch.where(plain == UNSEEN, UNSEEN, expected)
+    cut = 1 - (SIZE[0] - 1 - row) / (BORDER_MARGIN * SIZE[0])
+    expected = torch.where(cut > 0, plain.clamp_min(0) + BORDER_PENALTY * cut / (BORDER_POLE - cut), plain)
+    expected = torch.where(plain == INVISIBLE_PENALTY, INVISIBLE_PENALTY, expected)
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
-    assert ((cut > 0) & (plain < UNSEEN)).sum() > 10  # some lie in the margin
+    assert ((cut > 0) & (plain < INVISIBLE_PENALTY)).sum() > 10  # some lie in the margin
 
 
 def _penalties_of(chosen, view):
@@ -269,7 +271,7 @@ def test_depths_of_the_hull_are_computed_once_and_only_if_opacities_do_not_suffi
     by_surface = shown.with_surface(ball(side=32))
     by_surface.choose(points, directions, best=0, nearest=2)
     assert len(computed) == 1  # that of the surface
-    copies = [shown.with_penalties(Penalties.alike()), shown.with_handicaps(torch.zeros(len(shown))), by_surface]
+    copies = [shown.with_penalties(Penalties.binary()), shown.with_penalty_offsets(torch.zeros(len(shown))), by_surface]
     for each in (shown, *copies):
         torch.testing.assert_close(each.choose(points, best=2).coverage, coverage)
     assert len(computed) == 2

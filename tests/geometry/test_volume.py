@@ -7,7 +7,7 @@ import torch
 
 from hyperplanes.geometry import Sphere, carve
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes
-from hyperplanes.geometry.volume import CHANNELS, SIDE, interpolate_grid, volume_of
+from hyperplanes.geometry.volume import VALUES_PER_CELL, VOLUME_SIDE, interpolate_grid, volume_of
 from tests.reference_rendering import ball_views, ring
 
 
@@ -19,10 +19,10 @@ def planes_of(views, side=64):
 def test_the_occupied_shares_of_cells_are_those_of_the_hull():
     planes = planes_of(ball_views(ring(20, (48, 48))))
     share = volume_of(planes)[0]
-    assert share.shape == (SIDE, SIDE, SIDE)
+    assert share.shape == (VOLUME_SIDE, VOLUME_SIDE, VOLUME_SIDE)
     assert float(share.sum()) * 8 == pytest.approx(int(planes.occupancy.occupied.sum()))
     ball = 4 / 3 * math.pi * 0.5**3
-    assert ball < float(share.sum()) * (2 / SIDE) ** 3 < 1.4 * ball  # the hull contains the ball
+    assert ball < float(share.sum()) * (2 / VOLUME_SIDE) ** 3 < 1.4 * ball  # the hull contains the ball
 
 
 def test_cells_at_the_surface_have_the_colour_of_the_ball_and_those_outside_are_zero():
@@ -39,7 +39,7 @@ def test_cells_at_the_surface_have_the_colour_of_the_ball_and_those_outside_are_
 
 def test_cells_that_all_views_show_count_all_views():
     volume = volume_of(planes_of(ball_views(ring(7, (48, 48)))))
-    assert len(volume) == CHANNELS
+    assert len(volume) == VALUES_PER_CELL
     assert volume[4].max() == pytest.approx(math.log(7))
 
 
@@ -59,10 +59,10 @@ def test_the_order_of_the_views_does_not_matter():
 
 def test_a_linear_function_is_interpolated_exactly_and_constant_beyond_the_outermost_centres():
     bounds, weights = Sphere((0.5, -1.0, 2.0), 3.0), torch.tensor([0.3, -0.7, 0.2])
-    unit = (torch.arange(SIDE) + 0.5) * (2 / SIDE) - 1
+    unit = (torch.arange(VOLUME_SIDE) + 0.5) * (2 / VOLUME_SIDE) - 1
     x, y, z = torch.meshgrid(unit, unit, unit, indexing="ij")
     grid = (x * weights[0] + y * weights[1] + z * weights[2])[None]
-    inside = (torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1) * (1 - 1 / SIDE)
+    inside = (torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1) * (1 - 1 / VOLUME_SIDE)
     world = inside * bounds.radius + torch.tensor(bounds.centre)
     torch.testing.assert_close(interpolate_grid(grid, world, bounds)[:, 0], inside @ weights, atol=1e-5, rtol=1e-4)
     far = torch.tensor([[50.0, 50.0, 50.0]])

@@ -4,16 +4,21 @@ import pytest
 import torch
 from torch.nn.functional import conv3d
 
-from hyperplanes.geometry.volume import CHANNELS, SIDE
+from hyperplanes.geometry.volume import VALUES_PER_CELL, VOLUME_SIDE
 from hyperplanes.hypernetwork import Observed, VolumeHyperNetwork
 from hyperplanes.hypernetwork.volume.volume_network import VolumeNetwork, _Convolution, _fold, _Pointwise, _unfold
 
-GRIDS = {"coarse.grid.weight": torch.Size((2, SIDE, SIDE, SIDE)), "fine.grid.weight": torch.Size((5, SIDE, SIDE, SIDE))}
+GRIDS = {
+    "coarse.grid.weight": torch.Size((2, VOLUME_SIDE, VOLUME_SIDE, VOLUME_SIDE)),
+    "fine.grid.weight": torch.Size((5, VOLUME_SIDE, VOLUME_SIDE, VOLUME_SIDE)),
+}
 SHAPES = {**GRIDS, "fine.layers.0.weight": torch.Size((12, 7)), "fine.layers.0.bias": torch.Size((12,))}
 
 
 def volumes(count=3):
-    return torch.randn(count, CHANNELS, SIDE, SIDE, SIDE, generator=torch.Generator().manual_seed(1))
+    return torch.randn(
+        count, VALUES_PER_CELL, VOLUME_SIDE, VOLUME_SIDE, VOLUME_SIDE, generator=torch.Generator().manual_seed(1)
+    )
 
 
 def test_folding_keeps_every_value_and_blocks_become_channels():
@@ -26,7 +31,7 @@ def test_folding_keeps_every_value_and_blocks_become_channels():
 
 
 def test_an_untrained_hypernetwork_changes_nothing_and_names_the_grids_by_their_shapes():
-    network = VolumeHyperNetwork(SHAPES, CHANNELS, SIDE)
+    network = VolumeHyperNetwork(SHAPES, VALUES_PER_CELL, VOLUME_SIDE)
     for update in network(Observed(volume=volumes()), {}):
         assert {name: value.shape for name, value in update.items()} == GRIDS
         assert not any(value.any() for value in update.values())
@@ -34,7 +39,7 @@ def test_an_untrained_hypernetwork_changes_nothing_and_names_the_grids_by_their_
 
 def test_updates_of_objects_of_a_batch_are_independent():
     torch.manual_seed(2)
-    network = VolumeHyperNetwork(SHAPES, CHANNELS, SIDE).eval()
+    network = VolumeHyperNetwork(SHAPES, VALUES_PER_CELL, VOLUME_SIDE).eval()
     torch.nn.init.normal_(network.encoder.last.weight, std=0.1)
     with torch.no_grad():
         together = network(Observed(volume=volumes()), {})
@@ -46,7 +51,7 @@ def test_updates_of_objects_of_a_batch_are_independent():
 
 
 def test_features_of_a_cell_depend_on_its_neighbourhood():
-    network = VolumeNetwork(CHANNELS, SIDE, 4).eval()
+    network = VolumeNetwork(VALUES_PER_CELL, VOLUME_SIDE, 4).eval()
     torch.nn.init.normal_(network.last.weight, std=0.1)
     first = volumes(1)
     second = first.clone()
@@ -59,7 +64,7 @@ def test_features_of_a_cell_depend_on_its_neighbourhood():
 
 def test_a_side_that_cannot_be_halved_three_times_is_refused():
     with pytest.raises(ValueError, match="side: expected a multiple of 8, got 12"):
-        VolumeNetwork(CHANNELS, 12, 4)
+        VolumeNetwork(VALUES_PER_CELL, 12, 4)
 
 
 @pytest.mark.parametrize("count", [1, 2])  # a single volume has its own implementation

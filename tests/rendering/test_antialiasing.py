@@ -73,7 +73,7 @@ def test_pixels_at_edges_are_those_that_differ_from_a_neighbour(value):
     # Brute force: a loop over pixels, of one value at a time.
     values = torch.zeros(2, 5, 4, 4)
     values[..., value] = torch.rand(2, 5, 4, generator=torch.Generator().manual_seed(value))
-    found = images.pixels_at_edges(values, images.EDGE)
+    found = images.pixels_at_edges(values, images.EDGE_THRESHOLD)
     for view, row, column in found.new_ones(found.shape).nonzero().tolist():
         beside = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
         differences = [
@@ -81,7 +81,7 @@ def test_pixels_at_edges_are_those_that_differ_from_a_neighbour(value):
             for place in beside
             if 0 <= place[0] < 5 and 0 <= place[1] < 4
         ]
-        assert bool(found[view, row, column]) == (max(differences) >= images.EDGE)
+        assert bool(found[view, row, column]) == (max(differences) >= images.EDGE_THRESHOLD)
     assert 0 < found.sum() < found.numel()
 
 

@@ -30,7 +30,7 @@ CUTS = 0.25
 STRUCTURES = 0.3
 """Share of the objects with the structure of a table, a cart, a figure and so on."""
 
-APART = 0.003
+COPY_OFFSET = 0.003
 """Offset between copies, in extents of the solid: coplanar faces of two copies would flicker where they overlap."""
 
 MOST_FACES = 3000
@@ -106,7 +106,7 @@ def _arranged(rng: np.random.Generator, solid: Solid) -> Solid:
     kind = pick(rng, _ARRANGEMENTS)
     most = max(2, MOST_FACES // len(solid.faces))
     extents = np.ptp(solid.vertices, axis=0)
-    apart = np.full(3, APART * extents.max())
+    apart = np.full(3, COPY_OFFSET * extents.max())
     if kind == "mirrored":
         axis = int(rng.choice([0, 0, 2, 1]))
         mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
@@ -162,7 +162,7 @@ def _composed(rng: np.random.Generator) -> list[Solid]:
         edge = np.concatenate([solid.vertices for solid in solids])[:, 0]
         shift = -edge.min() - rng.uniform(0.1, 0.5) * np.ptp(edge)
         shifted = [solid.moved(shift) for solid in solids]
-        apart = APART * np.ptp(edge)
+        apart = COPY_OFFSET * np.ptp(edge)
         solids = [merged([solid, solid.mirrored().moved(0.0, apart, apart)]) for solid in shifted]
     return solids
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from data_gen.shapes.solids import Solid, signed_volume
 
-__all__ = ["CUT", "difference"]
+__all__ = ["CUT_FACE", "difference"]
 
-CUT = -2
+CUT_FACE = -2
 """First of the two `cells` of a face that was cut."""
 
 
@@ -40,8 +40,8 @@ def difference(solid: Solid, tool: Solid) -> Solid | None:
     """The part of a solid that lies outside another one.
 
     Returns:
-        The solid, with `CUT` as the first of `cells` on faces from the tool; None if Manifold refuses one of the two,
-        or nothing is left.
+        The solid, with `CUT_FACE` as the first of `cells` on faces from the tool; None if Manifold refuses one of the
+        two, or nothing is left.
     """
     (whole, number), (taken, _) = _manifold(solid), _manifold(tool)
     result = whole - taken  # invalid if either of the two is
@@ -55,6 +55,6 @@ def difference(solid: Solid, tool: Solid) -> Solid | None:
     vertices, faces = properties[used, :3], faces.reshape(-1, 3)
     runs = np.diff(np.asarray(mesh.run_index, dtype=np.int64)) // 3
     from_solid = np.repeat(np.asarray(mesh.run_original_id) == number, runs)
-    cells = np.where(from_solid[:, None], 0, (CUT, 0))
+    cells = np.where(from_solid[:, None], 0, (CUT_FACE, 0))
     uv = np.clip(properties[triangles][..., 3:5], 0, 1)
     return Solid(vertices, faces, uv, cells, signed_volume(vertices, faces), solid.crease)

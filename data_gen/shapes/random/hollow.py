@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_gen.shapes.profiles import ellipse, rectangle
-from data_gen.shapes.random.outlines import AROUND, outline
+from data_gen.shapes.random.outlines import OUTLINE_CORNERS, outline
 from data_gen.shapes.random.tubes import bar, subdivided, surface
 from data_gen.shapes.solids import Solid, merged
 
@@ -13,12 +13,12 @@ __all__ = ["arch", "pipe", "vessel", "wire_cage"]
 
 
 def _section(rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """A circle, a square or any outline (AROUND, 2), and the crease angle that suits it."""
+    """A circle, a square or any outline (OUTLINE_CORNERS, 2), and the crease angle that suits it."""
     draw = rng.random()
     if draw < 0.45:
-        return ellipse(1.0, 1.0, AROUND), 45.0
+        return ellipse(1.0, 1.0, OUTLINE_CORNERS), 45.0
     if draw < 0.75:
-        return subdivided(rectangle(2.0, 2.0), AROUND), 40.0
+        return subdivided(rectangle(2.0, 2.0), OUTLINE_CORNERS), 40.0
     return outline(rng)
 
 

@@ -13,12 +13,12 @@ import numpy as np
 from data_gen.shapes.choices import pick
 from data_gen.shapes.profiles import ellipse, rectangle
 from data_gen.shapes.random.hollow import arch, pipe, vessel, wire_cage
-from data_gen.shapes.random.outlines import AROUND, blob, outline
+from data_gen.shapes.random.outlines import OUTLINE_CORNERS, blob, outline
 from data_gen.shapes.random.relief import random_relief
 from data_gen.shapes.random.tubes import bar, subdivided, tube
 from data_gen.shapes.solids import Solid, merged
 
-__all__ = ["FRAMES", "PRIMITIVES", "Maker", "primitive"]
+__all__ = ["BAR_PRIMITIVES", "PRIMITIVES", "Maker", "primitive"]
 
 Maker = Callable[[np.random.Generator, bool], Solid]
 
@@ -33,7 +33,7 @@ def _upright(stations: int = _STATIONS) -> np.ndarray:
 def box(rng: np.random.Generator, fine: bool) -> Solid:
     """Cube, of many faces a side."""
     stations, inner = (7, 2) if fine else (2, 0)
-    section = subdivided(rectangle(2.0, 2.0), AROUND if fine else 4)
+    section = subdivided(rectangle(2.0, 2.0), OUTLINE_CORNERS if fine else 4)
     solid = tube(_upright(stations), np.tile(section, (stations, 1, 1)), inner=inner)
     return solid.repeated(int(rng.choice([1, 4]))).creased(40)
 
@@ -42,16 +42,18 @@ def cylinder(rng: np.random.Generator, fine: bool) -> Solid:
     """Cylinder, or a frustum of two radii."""
     stations, inner = (7, 2) if fine else (2, 0)
     radii = np.linspace(1.0, rng.uniform(0.4, 1.0) if rng.random() < 0.4 else 1.0, stations)
-    return tube(_upright(stations), radii[:, None, None] * ellipse(1.0, 1.0, AROUND), inner=inner).creased(40)
+    return tube(_upright(stations), radii[:, None, None] * ellipse(1.0, 1.0, OUTLINE_CORNERS), inner=inner).creased(40)
 
 
 def cone(rng: np.random.Generator, fine: bool) -> Solid:
     """Cone or pyramid with a tip."""
-    sides = int(rng.choice([3, 4, 5, AROUND, AROUND]))
+    sides = int(rng.choice([3, 4, 5, OUTLINE_CORNERS, OUTLINE_CORNERS]))
     stations, inner = (8, 2) if fine else (3, 0)
     radii = np.linspace(1.0, 0.0, stations)
-    section = subdivided(ellipse(1.0, 1.0, sides), AROUND if fine else sides)
-    return tube(_upright(stations), radii[:, None, None] * section, inner=inner).creased(50 if sides == AROUND else 30)
+    section = subdivided(ellipse(1.0, 1.0, sides), OUTLINE_CORNERS if fine else sides)
+    return tube(_upright(stations), radii[:, None, None] * section, inner=inner).creased(
+        50 if sides == OUTLINE_CORNERS else 30
+    )
 
 
 def ball(rng: np.random.Generator, fine: bool) -> Solid:
@@ -64,12 +66,12 @@ def ball(rng: np.random.Generator, fine: bool) -> Solid:
     if start == -1.0:
         radii[0] = 0
     spine = np.stack([np.zeros(13), np.sign(np.sin(angles)) * np.abs(np.sin(angles)) ** exponent, np.zeros(13)], axis=1)
-    return tube(spine, radii[:, None, None] * ellipse(1.0, 1.0, AROUND)).creased(60)
+    return tube(spine, radii[:, None, None] * ellipse(1.0, 1.0, OUTLINE_CORNERS)).creased(60)
 
 
 def torus(rng: np.random.Generator, fine: bool) -> Solid:
     """Ring of a round, square or random section, flat in the plane of x and z."""
-    angles = -np.arange(AROUND) * (2 * np.pi / AROUND)
+    angles = -np.arange(OUTLINE_CORNERS) * (2 * np.pi / OUTLINE_CORNERS)
     minor = rng.uniform(0.12, 0.45)
     section = minor * np.stack([np.cos(angles), np.sin(angles)], axis=1)[::-1][::2]
     crease = 60.0
@@ -77,7 +79,7 @@ def torus(rng: np.random.Generator, fine: bool) -> Solid:
         corners, crease = outline(rng)
         section = minor * corners[::2]
     circle = (1 - minor) * np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
-    return tube(circle, np.tile(section, (AROUND, 1, 1)), closed=True).creased(crease)
+    return tube(circle, np.tile(section, (OUTLINE_CORNERS, 1, 1)), closed=True).creased(crease)
 
 
 def capsule(rng: np.random.Generator, fine: bool) -> Solid:
@@ -88,7 +90,7 @@ def capsule(rng: np.random.Generator, fine: bool) -> Solid:
     profile = np.concatenate([(top * (1, -1))[::-1], top])
     profile[[0, -1], 0] = 0
     spine = np.stack([np.zeros(12), profile[:, 1], np.zeros(12)], axis=1)
-    return tube(spine, profile[:, :1, None] * ellipse(1.0, 1.0, AROUND) / radius).creased(60)
+    return tube(spine, profile[:, :1, None] * ellipse(1.0, 1.0, OUTLINE_CORNERS) / radius).creased(60)
 
 
 def lathe(rng: np.random.Generator, fine: bool) -> Solid:
@@ -107,7 +109,7 @@ def lathe(rng: np.random.Generator, fine: bool) -> Solid:
     if rng.random() < 0.3:
         profile[-1, 0] = 0
     spine = np.stack([np.zeros(len(profile)), profile[:, 1], np.zeros(len(profile))], axis=1)
-    return tube(spine, profile[:, :1, None] * ellipse(1.0, 1.0, AROUND)).creased(40)
+    return tube(spine, profile[:, :1, None] * ellipse(1.0, 1.0, OUTLINE_CORNERS)).creased(40)
 
 
 def loft(rng: np.random.Generator, fine: bool) -> Solid:
@@ -139,7 +141,7 @@ def _smooth_curve(rng: np.random.Generator, knots: int) -> np.ndarray:
 def bent_tube(rng: np.random.Generator, fine: bool) -> Solid:
     """A tube, round or not, along a random smooth curve."""
     spine = 0.9 * _smooth_curve(rng, int(rng.integers(3, 6)))
-    section, crease = (ellipse(1.0, 1.0, AROUND), 60.0) if rng.random() < 0.6 else outline(rng)
+    section, crease = (ellipse(1.0, 1.0, OUTLINE_CORNERS), 60.0) if rng.random() < 0.6 else outline(rng)
     widths = rng.uniform(0.05, 0.2) * _smooth(np.linspace(0, 1, 3), rng.uniform(0.6, 1.4, 3), np.linspace(0, 1, 20))
     if rng.random() < 0.2:
         widths[-1] = 0
@@ -224,7 +226,7 @@ PRIMITIVES: dict[Maker, float] = {
 """Relative frequencies."""
 
 
-FRAMES = (wire_box, wire_cage, grille, spring)
+BAR_PRIMITIVES = (wire_box, wire_cage, grille, spring)
 """Primitives made of bars, too thin for displacement."""
 
 
@@ -240,7 +242,7 @@ def primitive(rng: np.random.Generator, relief: float, makers: Iterable[Maker] =
         The solid.
     """
     maker = pick(rng, {maker: PRIMITIVES.get(maker, 1.0) for maker in makers})
-    fine = maker not in FRAMES and bool(rng.random() < relief)
+    fine = maker not in BAR_PRIMITIVES and bool(rng.random() < relief)
     solid = maker(rng, fine)
     if fine:
         solid = random_relief(rng, solid)

@@ -15,18 +15,19 @@ from hyperplanes.adaptation.alignment.rotation import Rotation
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.network import HyperPlanesNetwork
-from hyperplanes.geometry.kernels.threads import side_by_side
+from hyperplanes.geometry.kernels.threads import map_long_parts
 from hyperplanes.geometry.symmetry.reflections import Symmetry
 from hyperplanes.views import Views
 
 __all__ = ["Placed", "find_rotation", "to_canonical_frame"]
 
 FOLDS = 2  # views that are held out, one at a time; a third one finds no more
-FEWEST, MOST = FOLDS, 15  # numbers of views for which a frame is looked for
-SIZE, PIXELS = 64, 1024  # pixels of a held-out view along its longer side, and pixels that are compared
+MIN_VIEWS, MAX_VIEWS = FOLDS, 15  # numbers of views for which a frame is looked for
+HELD_OUT_SIZE = 64  # pixels of a held-out view along its longer side
+HELD_OUT_PIXELS = 1024  # that are compared
 GAIN = 0.75  # dB on held-out views that a rotation must gain over no rotation, if that is possible
-FLOOR = 1e-4  # of squared errors; smaller ones, as of empty views, say nothing
-MOST_PLANES = 2  # of symmetry: an object with more looks the same after each of the rotations
+MIN_SQUARED_ERROR = 1e-4  # of squared errors; smaller ones, as of empty views, say nothing
+MAX_ALIGNED_PLANES = 2  # of symmetry: an object with more looks the same after each of the rotations
 QUARTER = math.pi / 2
 ALIGNED = math.radians(0.5)  # a plane that is further from orthogonal to an axis is rotated
 
@@ -81,12 +82,18 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
     Returns:
         `config.azimuth` if that is known. Otherwise the one of the four with the highest mean PSNR on held-out views;
         if the plane is orthogonal to an axis already, a rotation must gain at least GAIN over none. The rotation by 0
-        if the object has no such plane or more than MOST_PLANES, and with fewer than FEWEST or more than MOST views.
+        if the object has no such plane or more than MAX_ALIGNED_PLANES, and with fewer than MIN_VIEWS or more than
+        MAX_VIEWS views.
     """
     config = network.config
     if config.azimuth is not None:
         return Rotation(config.azimuth)
-    if not config.symmetric or symmetry is None or symmetry.order > MOST_PLANES or not FEWEST <= len(support) <= MOST:
+    if (
+        not config.symmetric
+        or symmetry is None
+        or symmetry.order > MAX_ALIGNED_PLANES
+        or not MIN_VIEWS <= len(support) <= MAX_VIEWS
+    ):
         return Rotation()
     x, y, z = symmetry.plane.normal
     if abs(y) > math.hypot(x, z):
@@ -95,10 +102,10 @@ def find_rotation(network: HyperPlanesNetwork, support: Views, symmetry: Symmetr
     smallest = smallest if abs(smallest) > ALIGNED else 0.0
     rotations = [Rotation(smallest + turns * QUARTER) for turns in range(4)]
     # the same views are held out, one at a time, for each rotation
-    views = network.to_own(support).resized(SIZE)
+    views = network.to_own(support).resized(HELD_OUT_SIZE)
     placed = [Placed(each.views(views), each.symmetry(symmetry, views.bounds), each) for each in rotations]
     trials = [(each, held_out) for each in placed for held_out in range(FOLDS)]
-    found = side_by_side(lambda trial: _quality(network, *trial), trials, views.images.device)
+    found = map_long_parts(lambda trial: _quality(network, *trial), trials, views.images.device)
     qualities = [sum(found[start : start + FOLDS]) / FOLDS for start in range(0, len(found), FOLDS)]
     if not smallest:
         qualities[0] += GAIN
@@ -112,8 +119,8 @@ def _quality(network: HyperPlanesNetwork, placed: Placed, held_out: int) -> floa
     if shown.masks is not None and not shown.masks.any():
         return 0.0
     generator = torch.Generator().manual_seed(0)
-    rays, truth = views[[held_out]].sample_rays(PIXELS, generator=generator, near_far=near_far)
+    rays, truth = views[[held_out]].sample_rays(HELD_OUT_PIXELS, generator=generator, near_far=near_far)
     context = replace(placed, views=shown).context(network)
     field = network.field(context, network.adapted_weights(context))
     error = float((field.trace(rays, differentiable=False).colour - truth).square().mean())
-    return -10 * math.log10(max(error, FLOOR))
+    return -10 * math.log10(max(error, MIN_SQUARED_ERROR))

@@ -12,7 +12,8 @@ from hyperplanes.views import Views
 
 __all__ = ["find_symmetry"]
 
-SIZE, PIXELS = 128, 2048  # pixels of a single view along its longer side, and pixels that are compared
+SINGLE_VIEW_SIZE = 128  # pixels of a single view along its longer side
+SINGLE_VIEW_PIXELS = 2048  # that are compared
 
 
 @torch.no_grad()
@@ -38,12 +39,12 @@ def _of_one_view(network: HyperPlanesNetwork, view: Views) -> Symmetry | None:
     """
     if view.masks is None or not view.masks.any():
         return None
-    view = view.resized(SIZE)
+    view = view.resized(SINGLE_VIEW_SIZE)
     possible = possible_symmetries(view)
     if any(each.order > 1 for each in possible):
         return possible[0]
     near_far = network.config.sampling.near_far
-    rays, truth = view.sample_rays(PIXELS, generator=torch.Generator().manual_seed(0), near_far=near_far)
+    rays, truth = view.sample_rays(SINGLE_VIEW_PIXELS, generator=torch.Generator().manual_seed(0), near_far=near_far)
 
     def error(symmetry: Symmetry | None) -> float:
         context = network.prepare(view, symmetry=symmetry)

@@ -24,10 +24,12 @@ from hyperplanes.views import Views
 
 __all__ = ["HullBlend", "blend_views"]
 
-OPAQUE = 1e4  # density within the hull, per radius of the scene
-STOP = 2e-3  # transmittance; low enough to evaluate every sample: with every second one wings lose 0.05 to 0.5 dB
-SOLID = 0.5  # opacity of a mask from which on a pixel shows the object
-ROUNDING = 1e-4  # difference of opacities between kernels: without it 5 of 424,000 samples in the hull were holes
+HULL_DENSITY = 1e4  # density within the hull, per radius of the scene
+# transmittance; low enough to evaluate every sample: with every second one wings lose 0.05 to 0.5 dB
+STOP_TRANSMITTANCE = 2e-3
+MASK_THRESHOLD = 0.5  # opacity of a mask from which on a pixel shows the object
+# difference of opacities between kernels: without it 5 of 424,000 samples in the hull were holes
+OPACITY_TOLERANCE = 1e-4
 
 
 @checked_fields
@@ -80,12 +82,12 @@ class HullBlend:
         """
         region = planes.occupancy
         # voxels whose centre lies in the hull: with all voxels that it touches, its surface would seem too near
-        inside = centres_in_hull(planes, SOLID - ROUNDING)
-        depth = inside.occupied * (2 * OPAQUE / len(region.occupied))
+        inside = centres_in_hull(planes, MASK_THRESHOLD - OPACITY_TOLERANCE)
+        depth = inside.occupied * (2 * HULL_DENSITY / len(region.occupied))
         voxels = RefinedOccupancy(region.occupied, region.bounds, depth)
-        shown = planes.with_penalties(Penalties.alike()).with_surface(inside)
+        shown = planes.with_penalties(Penalties.binary()).with_surface(inside)
         blend = _Blend(shown, region.bounds, self.nearest)
-        sampling = _FirstInHull(self.steps, STOP, planes=planes)
+        sampling = _FirstInHull(self.steps, STOP_TRANSMITTANCE, planes=planes)
         return AdaptedField(blend, region, sampling, densities=(blend.density,), refined=voxels)
 
 
@@ -133,7 +135,7 @@ class _FirstInHull(RayMarching):
         if occupancy is None or generator is not None or not self.planes.has_kernels(rays.origins):
             return super().place(rays, occupancy, generator)
         step = 2 * occupancy.bounds.radius / self.steps
-        distances = hull_hits(self.planes, rays, rays.near + step / 2, step, occupancy, SOLID)
+        distances = hull_hits(self.planes, rays, rays.near + step / 2, step, occupancy, MASK_THRESHOLD)
         ray = distances.isfinite().nonzero()[:, 0]
         return OpaqueSamples(ray, distances[ray], step)
 
@@ -162,7 +164,7 @@ class _Blend:
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """High where every view that shows a point shows the object there, otherwise 0."""
         coverage = self.planes.choose(points, best=0).coverage
-        return torch.where(coverage < SOLID - ROUNDING, 0.0, OPAQUE / self.bounds.radius)
+        return torch.where(coverage < MASK_THRESHOLD - OPACITY_TOLERANCE, 0.0, HULL_DENSITY / self.bounds.radius)
 
     def hidden(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
         """The points themselves: densities and colours share no computation."""

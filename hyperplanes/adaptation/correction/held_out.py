@@ -19,16 +19,17 @@ from hyperplanes.geometry.symmetry.reflections import Symmetry
 from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.views import Views
 
-__all__ = ["FEWEST", "HeldOutPixels", "Trial", "hold_out"]
+__all__ = ["MIN_VIEWS", "HeldOutPixels", "Trial", "hold_out"]
 
-FEWEST = 5  # views of which some can be held out
-HELD_OUT = 2  # least number of held-out views
-# one view in ONE_IN is held out, if that is more than HELD_OUT: 3 of 47 instead of 2 gain 0.16 ± 0.14 dB (20 objects,
-# all by two of them)
+MIN_VIEWS = 5  # views of which some can be held out
+MIN_HELD_OUT = 2  # least number of held-out views
+# one view in ONE_IN is held out, if that is more than MIN_HELD_OUT: 3 of 47 instead of 2 gain 0.16 ± 0.14 dB (20
+# objects, all by two of them)
 ONE_IN = 12
-PIXELS = 2048  # of the held-out views
+HELD_OUT_PIXELS = 2048  # of the held-out views
 EVEN = 0.2  # contrast up to which one ray through a pixel serves as well as three: half the rays
-SIZE = 128  # most pixels of all views along the longer side: 256 find no better shares and take three times as long
+# most pixels of all views along the longer side: 256 find no better shares and take three times as long
+MAX_IMAGE_SIZE = 128
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Trial:
 
 @torch.no_grad()
 def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | None = None) -> Trial | None:
-    """Holds out two views or one in twelve, those closest to the others; all are resized to SIZE pixels at most.
+    """Holds out two views or one in twelve, those closest to the others; all are at most MAX_IMAGE_SIZE pixels large.
 
     Args:
         network: of a field that takes any number of views.
@@ -83,14 +84,14 @@ def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | N
         symmetry: by which the other views are reflected.
 
     Returns:
-        None with fewer than FEWEST views, without masks, and where only the held-out views see the object, or none of
-        them does.
+        None with fewer than MIN_VIEWS views, without masks, and where only the held-out views see the object, or none
+        of them does.
     """
-    if len(support) < FEWEST or support.masks is None:
+    if len(support) < MIN_VIEWS or support.masks is None:
         return None
-    support = support.resized(SIZE)
+    support = support.resized(MAX_IMAGE_SIZE)
     order = outermost_first(support.camera_directions.cpu(), len(support))
-    count = max(HELD_OUT, len(support) // ONE_IN)
+    count = max(MIN_HELD_OUT, len(support) // ONE_IN)
     shown, held_out = support[sorted(order[:-count])], support[order[-count:]]
     assert shown.masks is not None
     if not shown.masks.any():
@@ -100,7 +101,9 @@ def hold_out(network: HyperPlanesNetwork, support: Views, symmetry: Symmetry | N
     if not len(among):
         return None
     near_far = network.config.sampling.near_far
-    pixels = among[torch.randint(len(among), (PIXELS,), generator=torch.Generator().manual_seed(0)).to(among.device)]
+    pixels = among[
+        torch.randint(len(among), (HELD_OUT_PIXELS,), generator=torch.Generator().manual_seed(0)).to(among.device)
+    ]
     uneven = contrast(held_out.images).flatten()[pixels] > EVEN
     one, colours, _ = held_out.rays_at(pixels[~uneven], near_far=near_far)
     three, others, _ = held_out.rays_at(pixels[uneven], near_far=near_far, subpixels=SUBPIXELS)

@@ -34,13 +34,14 @@ from hyperplanes.views import Views
 
 __all__ = ["CorrectedField", "ResidualField", "are_corrected", "corrected_field"]
 
-SHARPNESS = 10.0  # of weights as a function of 1 - the cosine of the angle between rays: a third at 27 degrees
-WIDEST = 0.5  # value of 1 - cosine from which on the weight is 0: 60 degrees
-TOLERANCE = 0.25  # distance from the surface that a support view sees, in radii, at which the weight is 1 / e
+ANGULAR_FALLOFF = 10.0  # of weights as a function of 1 - the cosine of the angle between rays: a third at 27 degrees
+MAX_COSINE_DISTANCE = 0.5  # value of 1 - cosine from which on the weight is 0: 60 degrees
+DISTANCE_SCALE = 0.25  # distance from the surface that a support view sees, in radii, at which the weight is 1 / e
 DOUBT = 0.3  # weight of a residual of zero
-FAINT, SOLID = 0.01, 1 / 3  # opacities from which on a pixel is corrected in part, and in full
-PAIRS = 1 << 18  # of a pixel and a support view, processed at once
-MOST_PIXELS = 1 << 21  # of support views, such as 52 of 200x200, which take 20 s of two cores
+MIN_CORRECTED_OPACITY = 0.01  # from which on a pixel is corrected in part
+FULL_CORRECTION_OPACITY = 1 / 3  # and in full
+PAIR_CHUNK = 1 << 18  # of a pixel and a support view, processed at once
+MAX_SUPPORT_PIXELS = 1 << 21  # of support views, such as 52 of 200x200, which take 20 s of two cores
 
 _rendering = RLock()  # so that two threads that need the same support views render them once
 
@@ -95,10 +96,10 @@ class ResidualField:
         pixels = pixel_grid(*camera.image_size(cameras), images.device)
         for view in range(len(images)):
             opacity, depth = (each[view].flatten() for each in (pictures.opacity, pictures.depth))
-            seen = ((opacity > FAINT) & (depth > 0)).nonzero()[:, 0]
+            seen = ((opacity > MIN_CORRECTED_OPACITY) & (depth > 0)).nonzero()[:, 0]
             rays = cast(cameras, torch.full_like(seen, view), pixels[seen], self.views.bounds)
             added = self._blended(rays.at(depth[seen].to(rays.directions)), rays.directions).to(images)
-            images[view].view(3, -1)[:, seen] += added.T * (opacity[seen] / SOLID).clamp(max=1)
+            images[view].view(3, -1)[:, seen] += added.T * (opacity[seen] / FULL_CORRECTION_OPACITY).clamp(max=1)
         return replace(pictures, images=images.clamp(0, 1))
 
     @torch.no_grad()
@@ -116,7 +117,7 @@ class ResidualField:
     def _blended(self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]) -> Tensor:
         """The weighted mean of the residuals of support views at points seen along these directions."""
         points, directions = points.to(self._planes.images), directions.to(self._planes.images)
-        size = max(1, PAIRS // len(self.views))
+        size = max(1, PAIR_CHUNK // len(self.views))
         parts = list(zip(points.split(size), directions.split(size), strict=True))
         near = torch.zeros(len(self.views), dtype=torch.bool, device=points.device)
         for part in parts:
@@ -133,9 +134,11 @@ class ResidualField:
             residual, moment, opacity = found.colours.split([3, 1, 1], -1)
             apart = found.distances - (moment / opacity.clamp_min(1e-3)).squeeze(-1)
             aside = 1 - (found.directions * along[:, None]).sum(-1)
-            weights = (torch.exp(-SHARPNESS * aside) - math.exp(-SHARPNESS * WIDEST)).clamp_min(0)
+            weights = (
+                torch.exp(-ANGULAR_FALLOFF * aside) - math.exp(-ANGULAR_FALLOFF * MAX_COSINE_DISTANCE)
+            ).clamp_min(0)
             # outside of an image opacity is 0, so the surface seems to be at the camera, and the weight is 0
-            weights = weights * torch.exp(-(apart / (TOLERANCE * self.views.bounds.radius)).square())
+            weights = weights * torch.exp(-(apart / (DISTANCE_SCALE * self.views.bounds.radius)).square())
             blended.append((weights[..., None] * residual).sum(1) / (weights.sum(1, keepdim=True) + DOUBT))
         return torch.cat(blended)
 
@@ -143,7 +146,7 @@ class ResidualField:
         """The support views with a weight above 0 for any of the points."""
         offsets = points[:, None] - camera.centres(self._planes.cameras).to(points)
         cosines = (torch.nn.functional.normalize(offsets, dim=-1) * directions[:, None]).sum(-1)
-        return (1 - cosines < WIDEST).any(0)
+        return (1 - cosines < MAX_COSINE_DISTANCE).any(0)
 
     def _compute(self, chosen: list[int]) -> None:
         """Computes residual, depth times opacity, and opacity of the chosen support views, unless done already.
@@ -213,7 +216,7 @@ class CorrectedField(AdaptedField):
 def are_corrected(network: HyperPlanesNetwork, support: Views) -> bool:
     """Whether pictures of the field that a model makes are corrected.
 
-    The model must be configured so, and there must be MANY_VIEWS or more, with masks and MOST_PIXELS at most.
+    The model must be configured so, and there must be MANY_VIEWS or more, with masks and MAX_SUPPORT_PIXELS at most.
 
     Args:
         network: the model.
@@ -221,7 +224,7 @@ def are_corrected(network: HyperPlanesNetwork, support: Views) -> bool:
     """
     height, width = support.size
     enough = len(support) >= MANY_VIEWS and support.masks is not None
-    return network.config.residuals and enough and len(support) * height * width <= MOST_PIXELS
+    return network.config.residuals and enough and len(support) * height * width <= MAX_SUPPORT_PIXELS
 
 
 def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support: Views) -> AdaptedField:

@@ -15,12 +15,12 @@ from hyperplanes.adaptation.alignment.rotation import RotatedField
 from hyperplanes.adaptation.base import AdaptedField, Pictures, attributes_of
 from hyperplanes.adaptation.baselines.hull_blend import HullBlend
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.adaptation.correction.held_out import FEWEST, Trial, hold_out
+from hyperplanes.adaptation.correction.held_out import MIN_VIEWS, Trial, hold_out
 from hyperplanes.adaptation.correction.residuals import are_corrected
 from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.network import HyperPlanesNetwork, in_use
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
-from hyperplanes.geometry.kernels.threads import at_once
+from hyperplanes.geometry.kernels.threads import run_concurrently
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.parameters import Parameters
@@ -44,7 +44,7 @@ __all__ = [
 
 CAUTION = 1.5  # power of the best share for the few held-out views, to be cautious (docs/image-based.md, "Stacking")
 OVERRULED = 0.8  # share of the hull above which its surface is used
-MARGIN = 0.02  # relative reduction of the squared error that is worth a second picture
+MIN_ERROR_REDUCTION = 0.02  # relative reduction of the squared error that is worth a second picture
 
 Pixels = TypeVar("Pixels", Rendered, Pictures)
 
@@ -67,7 +67,7 @@ class StackedField(AdaptedField):
     share: float = field(kw_only=True)
     overruled: bool = field(default=False, kw_only=True)
     gate: GatingNetwork | None = field(default=None, kw_only=True)
-    views: int = field(default=FEWEST, kw_only=True)
+    views: int = field(default=MIN_VIEWS, kw_only=True)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({super().__repr__()}, {self.share:.0%} of {self.other!r})"
@@ -97,7 +97,7 @@ class StackedField(AdaptedField):
         other = partial(self.other.render, cameras, of_other, antialias, mixed_precision=mixed_precision)
         if not (self.thread_safe and self.other.thread_safe):
             return self._mean(own(), other())
-        return self._mean(*at_once(own, other, self.occupancy.occupied.device))
+        return self._mean(*run_concurrently(own, other, self.occupancy.occupied.device))
 
     def _samplers(self, sampling: Sampler | None) -> tuple[Sampler | None, Sampler | None]:
         """The given sampler for whichever of the field and the other one is learned, None for the visual hull."""
@@ -169,7 +169,7 @@ def learned_part(adapted: AdaptedField) -> Learned:
 
 
 def stack(
-    learned: AdaptedField, hull: AdaptedField, share: float, gate: GatingNetwork | None = None, views: int = FEWEST
+    learned: AdaptedField, hull: AdaptedField, share: float, gate: GatingNetwork | None = None, views: int = MIN_VIEWS
 ) -> AdaptedField:
     """Two fields as one, whose pictures are averages of those of both.
 
@@ -221,8 +221,8 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
     """The field of given weights, stacked with the visual hull if the model is configured so.
 
     The share of the hull is that for the object's own update (`hull_share`), whatever the weights are, or the one in
-    the configuration. With FEWEST views or more, counting reflections, the gating network of the model, if any, turns
-    it into one for each pixel.
+    the configuration. With MIN_VIEWS views or more, counting reflections, the gating network of the model, if any,
+    turns it into one for each pixel.
 
     Args:
         network: the model.
@@ -238,7 +238,7 @@ def stacked_field(network: HyperPlanesNetwork, context: SupportContext, weights:
     if network.config.stacked:
         with in_use(network):
             share = hull_share(hold_out(network, context.given, context.symmetry))
-    gate = network.gate if len(context.views) >= FEWEST else None
+    gate = network.gate if len(context.views) >= MIN_VIEWS else None
     if not share and gate is None:
         return learned
     return stack(learned, hull_field(context), share, gate, len(context.views))
@@ -287,14 +287,14 @@ def hull_share(trial: Trial | None) -> float:
 
     Returns:
         The share in [0, 1]: the best one (`best_share`) to the power of CAUTION. It is 0 without a trial, or if it
-        lowers the squared error by less than MARGIN.
+        lowers the squared error by less than MIN_ERROR_REDUCTION.
     """
     if trial is None:
         return 0.0
     without, hull = (trial.pixels.errors(each) for each in (trial.learned, hull_field(trial.context)))
     share = best_share(without, hull) ** CAUTION
     mixed = torch.lerp(without, hull, share)
-    return share if float(mixed.square().sum()) < (1 - MARGIN) * float(without.square().sum()) else 0.0
+    return share if float(mixed.square().sum()) < (1 - MIN_ERROR_REDUCTION) * float(without.square().sum()) else 0.0
 
 
 def hull_field(context: SupportContext) -> AdaptedField:

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from hyperplanes.adaptation.context import SupportContext, trained_on
-from hyperplanes.adaptation.network import GRID, HyperPlanesNetwork
+from hyperplanes.adaptation.network import GRID_WEIGHT, HyperPlanesNetwork
 from hyperplanes.adaptation.optimisation.descent import pixels_of, ray_loss
 from hyperplanes.adaptation.optimisation.gradients import summed_gradients
 from hyperplanes.configuration.fine_tuning import FINE_VIEWS
@@ -15,7 +15,7 @@ from hyperplanes.parameters import Parameters
 
 __all__ = ["grid_gradient", "step_inputs", "take_learned_steps", "updated_weights"]
 
-RAYS, PARTS = 2048, 4  # rays of a step, and parts that they are divided into, each with other views masked
+RAYS_PER_STEP, PARTS = 2048, 4  # rays of a step, and parts that they are divided into, each with other views masked
 ONE_IN = 6  # a part masks one view in ONE_IN
 
 
@@ -52,9 +52,9 @@ def take_learned_steps(
     steps = network.config.learned_steps if steps is None else steps
     generator = torch.Generator().manual_seed(0)
     for _ in range(steps if len(context.given) < FINE_VIEWS else -(-steps // 2)):
-        inputs = step_inputs(network, context, weights, RAYS, generator)
+        inputs = step_inputs(network, context, weights, RAYS_PER_STEP, generator)
         with torch.no_grad():
-            weights = weights + {GRID: step(*inputs)[0]}
+            weights = weights + {GRID_WEIGHT: step(*inputs)[0]}
     return weights
 
 
@@ -79,7 +79,7 @@ def step_inputs(
     """
     assert context.volume is not None
     gradient = grid_gradient(network, context, weights, rays, generator, pixels=pixels)
-    return context.volume[None, :1], weights[GRID][None], gradient[None]
+    return context.volume[None, :1], weights[GRID_WEIGHT][None], gradient[None]
 
 
 def grid_gradient(
@@ -111,8 +111,8 @@ def grid_gradient(
         pixels = network.live_pixels_of(context, views)
     parts = _masked(len(views), generator)
     generators = [torch.Generator().manual_seed(int(torch.randint(2**62, (), generator=generator))) for _ in parts]
-    grid = weights[GRID].detach().clone().requires_grad_(True)
-    variable = Parameters({**weights.detach(), GRID: grid})
+    grid = weights[GRID_WEIGHT].detach().clone().requires_grad_(True)
+    variable = Parameters({**weights.detach(), GRID_WEIGHT: grid})
 
     def loss(part: int) -> Tensor:
         masked = parts[part].to(views.images.device)

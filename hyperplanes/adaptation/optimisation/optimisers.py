@@ -14,9 +14,9 @@ from hyperplanes.utilities.tensors.uncompiled_optimisers import SGD, Adam, Optim
 
 __all__ = ["Muon", "make_optimisers", "orthogonalise"]
 
-COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of the quintic Newton-Schulz iteration of Jordan et al. 2024
-ITERATIONS = 5
-MOMENTUM = 0.95  # of Muon
+NEWTON_SCHULZ_COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of the quintic Newton-Schulz iteration of Jordan et al. 2024
+NEWTON_SCHULZ_ITERATIONS = 5
+MUON_MOMENTUM = 0.95
 NARROWEST = 16  # matrices with fewer rows or columns, such as the heads of colour and density, are left to Adam
 
 
@@ -29,11 +29,11 @@ def orthogonalise(matrix: Float[Tensor, "row column"]) -> Float[Tensor, "row col
     Args:
         matrix: of any scale.
     """
-    a, b, c = COEFFICIENTS
+    a, b, c = NEWTON_SCHULZ_COEFFICIENTS
     tall = matrix.shape[0] > matrix.shape[1]
     value = matrix.mT if tall else matrix
     value = value / value.norm().clamp_min(1e-7)
-    for _ in range(ITERATIONS):
+    for _ in range(NEWTON_SCHULZ_ITERATIONS):
         gram = value @ value.mT
         value = torch.addmm(value, torch.addmm(gram, gram, gram, beta=b, alpha=c), value, beta=a)
     return value.mT if tall else value
@@ -63,10 +63,10 @@ class Muon(Optimizer):
             moved = [value for value in group["params"] if value.grad is not None]
             for value in moved:
                 momentum = self.state[value].setdefault("momentum", torch.zeros_like(value))
-                momentum.lerp_(value.grad, 1 - MOMENTUM)
+                momentum.lerp_(value.grad, 1 - MUON_MOMENTUM)
             # on a CPU, one thread per matrix is faster for small products than all threads for each
             run = parallel_map if all(value.device.type == "cpu" for value in moved) else map
-            ahead = [value.grad.lerp(self.state[value]["momentum"], MOMENTUM) for value in moved]
+            ahead = [value.grad.lerp(self.state[value]["momentum"], MUON_MOMENTUM) for value in moved]
             for value, direction in zip(moved, run(orthogonalise, ahead), strict=True):
                 value.add_(direction, alpha=-group["lr"] * max(1, value.shape[0] / value.shape[1]) ** 0.5)
 

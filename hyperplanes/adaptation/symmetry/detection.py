@@ -14,13 +14,13 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.baselines.hull_blend import HullBlend
 from hyperplanes.adaptation.context import live_pixels
 from hyperplanes.adaptation.symmetry.judging import (
-    TOLERANCE,
+    MAX_ERROR_RATIO,
     SymmetryJudge,
     best_vertical_plane,
     carved,
 )
-from hyperplanes.adaptation.symmetry.reflections import HULL_SIDE, handicaps, with_reflections
-from hyperplanes.geometry.kernels.threads import side_by_side
+from hyperplanes.adaptation.symmetry.reflections import HULL_SIDE, penalty_offsets, with_reflections
+from hyperplanes.geometry.kernels.threads import map_long_parts
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.poses import farthest_first
 from hyperplanes.geometry.rays import Rays
@@ -30,19 +30,19 @@ from hyperplanes.views import Views
 
 __all__ = ["ReflectedHullBlend", "possible_symmetries", "symmetry_of"]
 
-FEWEST = 2  # views to judge planes by: a single one contradicts none
+MIN_VIEWS = 2  # views to judge planes by: a single one contradicts none
 FEWEST_TO_REFINE = 10  # views whose hull is near enough to the object to find planes by it
-MOST = 8  # views that are used
+MAX_VIEWS = 8  # views that are used
 SINGLE_VIEW_ORDER = 3  # at least: in one view, many cars look the same from the front and the back
 SINGLE_VIEW_TOLERANCE = 1.5  # of such an order: 1.7 for a car and a lamp without it, up to 1.3 for solids of revolution
 ALIKE = 1.02  # ratio of errors that counts as equal
 FOLDS, ONE_IN = 3, 6  # of cross-validation, each of which holds out one view in ONE_IN
-FEW = 16  # number of views below which held-out views must gain more
+FEW_VIEWS = 16  # number of views below which held-out views must gain more
 GAIN_OF_FEW, GAIN = 0.6, 0.1  # dB that held-out views must gain with reflections
-JUDGED_SIZE, PIXELS = 128, 1024  # most pixels of views along the longer side, and pixels compared in each fold
+FOLD_SIZE, PIXELS_PER_FOLD = 128, 1024  # most pixels of views along the longer side, and pixels compared in each fold
 
 VERTICAL = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-AXES = (*VERTICAL, (0.0, 1.0, 0.0))
+PRINCIPAL_NORMALS = (*VERTICAL, (0.0, 1.0, 0.0))
 """Normals of the planes that are tried first."""
 
 
@@ -62,21 +62,21 @@ def symmetry_of(support: Views) -> Symmetry | None:
     improve held-out views by GAIN_OF_FEW or GAIN.
 
     Args:
-        support: views with masks, y up; the MOST that are farthest apart are used.
+        support: views with masks, y up; the MAX_VIEWS that are farthest apart are used.
 
     Returns:
-        The symmetry with which `HullBlend` renders the views best, if its squared error is at most TOLERANCE times that
-        without reflections; None with fewer than FEWEST views, or without masks.
+        The symmetry with which `HullBlend` renders the views best, if its squared error is at most MAX_ERROR_RATIO
+        times that without reflections; None with fewer than MIN_VIEWS views, or without masks.
     """
-    if support.masks is None or len(support) < FEWEST or not support.masks.any():
+    if support.masks is None or len(support) < MIN_VIEWS or not support.masks.any():
         return None
-    chosen = farthest_first(support.camera_directions.cpu(), 0, min(MOST, len(support)))
+    chosen = farthest_first(support.camera_directions.cpu(), 0, min(MAX_VIEWS, len(support)))
     views = support[sorted(chosen)]
     judge = SymmetryJudge.of(views)
-    across = judge.errors([Plane.of_sphere(support.bounds, normal) for normal in AXES], TOLERANCE)
+    across = judge.errors([Plane.of_sphere(support.bounds, normal) for normal in PRINCIPAL_NORMALS], MAX_ERROR_RATIO)
     if len(support) >= FEWEST_TO_REFINE:
         return _of_many(support, judge, across)
-    errors = across or judge.errors([best_vertical_plane(judge, views)], TOLERANCE)
+    errors = across or judge.errors([best_vertical_plane(judge, views)], MAX_ERROR_RATIO)
     if not errors:
         return None
     found = _least(errors)
@@ -132,11 +132,11 @@ def _of_many(support: Views, judge: SymmetryJudge, across: Mapping[Plane, float]
         more = more_symmetric_plane(voxels, _least(across))
     else:
         more = most_symmetric_plane(voxels)
-    errors = {**across, **judge.errors([more], TOLERANCE)}
+    errors = {**across, **judge.errors([more], MAX_ERROR_RATIO)}
     if not errors:
         return None
     symmetry = Symmetry(min(errors, key=errors.__getitem__))
-    needed = GAIN_OF_FEW if len(support) < FEW else GAIN
+    needed = GAIN_OF_FEW if len(support) < FEW_VIEWS else GAIN
     return symmetry if _held_out_gain(support, symmetry) >= needed else None
 
 
@@ -144,7 +144,9 @@ def _blend(support: Views, symmetry: Symmetry | None, known: Occupancy | None = 
     """`HullBlend` of views, and of their reflections if there is a symmetry; `known` is the hull of the views."""
     blend = HullBlend(side=HULL_SIDE)
     planes = blend.planes_of(with_reflections(support, symmetry, known), known)
-    return blend.adapt_to(planes if symmetry is None else planes.with_handicaps(handicaps(len(support), symmetry)))
+    if symmetry is not None:
+        planes = planes.with_penalty_offsets(penalty_offsets(len(support), symmetry))
+    return blend.adapt_to(planes)
 
 
 def _held_out_gain(support: Views, symmetry: Symmetry) -> float:
@@ -153,11 +155,11 @@ def _held_out_gain(support: Views, symmetry: Symmetry) -> float:
     One view in ONE_IN is held out FOLDS times (cross-validation, Stone 1974), and the same pixels are compared. This
     needs no weights, and says more than two views held out from a trained field (docs/image-based-measurements.md).
     """
-    views = support.resized(JUDGED_SIZE)
+    views = support.resized(FOLD_SIZE)
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(0)).tolist()
     folds = [Fold.of(views, sorted(order[fold::ONE_IN])) for fold in range(FOLDS)]
     trials = [(fold, by) for by in (symmetry, None) for fold in folds]  # the longer ones first
-    errors = side_by_side(lambda trial: trial[0].error(trial[1]), trials, views.images.device)
+    errors = map_long_parts(lambda trial: trial[0].error(trial[1]), trials, views.images.device)
     reflected, alone = sum(errors[:FOLDS]), sum(errors[FOLDS:])
     return 10 * math.log10(alone / reflected) if reflected else math.inf
 
@@ -180,11 +182,11 @@ class Fold:
 
     @classmethod
     def of(cls, views: Views, held_out: list[int]) -> Fold:
-        """The fold in which these views are held out, with PIXELS rays at most."""
+        """The fold in which these views are held out, with PIXELS_PER_FOLD rays at most."""
         shown, others = views[sorted({*range(len(views))} - {*held_out})], views[held_out]
         voxels = carved(shown)
         among = live_pixels(voxels, others)
-        drawn = torch.randint(max(1, len(among)), (PIXELS,), generator=torch.Generator().manual_seed(0))
+        drawn = torch.randint(max(1, len(among)), (PIXELS_PER_FOLD,), generator=torch.Generator().manual_seed(0))
         rays, truth, _ = others.rays_at(among[drawn.to(among.device)] if len(among) else among)
         return cls(shown, voxels, rays, truth)
 

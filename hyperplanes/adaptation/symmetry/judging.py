@@ -12,33 +12,34 @@ from torch import Tensor
 
 from hyperplanes.adaptation.baselines.hull_blend import HullBlend
 from hyperplanes.adaptation.context import live_pixels
-from hyperplanes.adaptation.symmetry.reflections import HULL_SIDE, SHOWN, images_by
-from hyperplanes.geometry.kernels.threads import side_by_side
+from hyperplanes.adaptation.symmetry.reflections import HULL_SIDE, MIN_OBJECT_OPACITY, images_by
+from hyperplanes.geometry.kernels.threads import map_long_parts
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Rays, Sphere, join_rays
 from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.rendering.footprint import footprint
-from hyperplanes.rendering.images import EDGE, EDGE_SUBPIXELS, pixels_at_edges
+from hyperplanes.rendering.images import EDGE_SUBPIXELS, EDGE_THRESHOLD, pixels_at_edges
 from hyperplanes.views import Views
 
-__all__ = ["TOLERANCE", "SymmetryJudge", "best_vertical_plane", "carved"]
+__all__ = ["MAX_ERROR_RATIO", "SymmetryJudge", "best_vertical_plane", "carved"]
 
-SIZE, COARSE_SIZE = 64, 32  # most pixels of views along the longer side: to judge a plane, and to search for one
+JUDGED_SIZE, COARSE_SIZE = 64, 32  # most pixels of views along the longer side: to judge a plane, and to search for one
 COARSE_HULL = 48  # voxels an axis, to search for one
-STEPS = 2  # of rays in a voxel
+STEPS_PER_VOXEL = 2  # of rays in a voxel
 AZIMUTHS = 24  # number of vertical planes that are tried
-NEARLY = 1.5  # times the least error, up to which the second best of these is refined too
+MAX_SECOND_ERROR_RATIO = 1.5  # times the least error, up to which the second best of these is refined too
 COARSE_ROUNDS, FINE_ROUNDS = 3, 2  # of refinement
-SPAN = 0.04  # first change of a plane's offset, in radii of the scene
+OFFSET_STEP = 0.04  # first change of a plane's offset, in radii of the scene
 LOST = 0.05  # fraction of the object's pixels that the hull with reflections may miss
-TOLERANCE = 1.75  # times the squared error without reflections, up to which an object counts as symmetric
-FLOOR = 3e-3  # added to the squared error per pixel of the object; smaller errors come from the voxels of the hull
+MAX_ERROR_RATIO = 1.75  # times the squared error without reflections, up to which an object counts as symmetric
+# added to the squared error per pixel of the object; smaller errors come from the voxels of the hull
+ERROR_OFFSET = 3e-3
 
 ORDERS = {2: (), 3: (), 4: (2,), 6: (2, 3), 8: (2, 4)}
 """Orders that are tried, each with the lower ones that it implies."""
 MOST_IMAGES = 64  # views and reflections; more do not improve pictures and take longer
-MOST_PIXELS = 1 << 25  # of these for several planes: with 192 million adapting takes 10 GB and ten times as long
+MAX_REFLECTED_PIXELS = 1 << 25  # for several planes: with 192 million adapting takes 10 GB and ten times as long
 WORTH = 0.5  # the error may grow with this power of the order
 
 
@@ -62,7 +63,7 @@ class _PixelRays:
         assert views.masks is not None
         # after scaling down, an edge is two pixels wide, and each differs half as much
         values = torch.cat([views.images, views.masks], 1).permute(0, 2, 3, 1)
-        edges = pixels[pixels_at_edges(values, EDGE / 2).flatten()[pixels]]
+        edges = pixels[pixels_at_edges(values, EDGE_THRESHOLD / 2).flatten()[pixels]]
         centres, _, _ = views.rays_at(pixels)
         others, _, _ = views.rays_at(edges, subpixels=EDGE_SUBPIXELS[1:])
         through = torch.cat([pixels, edges.repeat(len(EDGE_SUBPIXELS) - 1)])
@@ -94,22 +95,22 @@ class SymmetryJudge:
     floor: float
 
     @classmethod
-    def of(cls, support: Views, size: int = SIZE, side: int = HULL_SIDE) -> SymmetryJudge:
+    def of(cls, support: Views, size: int = JUDGED_SIZE, side: int = HULL_SIDE) -> SymmetryJudge:
         """The judge of views with masks, resized to at most `size` pixels along the longer side."""
         views = support.resized(size)
         assert views.masks is not None
-        voxels, floor = carved(views, side), FLOOR * float((views.masks >= SHOWN).sum())
+        voxels, floor = carved(views, side), ERROR_OFFSET * float((views.masks >= MIN_OBJECT_OPACITY).sum())
         judge = cls(views, voxels, _PixelRays.of(views, live_pixels(voxels, views)), 1.0, floor)
         return replace(judge, alone=judge.squared_error(None) + floor)
 
     def errors(self, planes: Sequence[Plane], most: float = math.inf) -> dict[Plane, float]:
         """The errors of the planes for which they are finite and at most `most`."""
-        errors = side_by_side(lambda plane: self.error(Symmetry(plane)), planes, self.views.images.device)
+        errors = map_long_parts(lambda plane: self.error(Symmetry(plane)), planes, self.views.images.device)
         found = zip(planes, errors, strict=True)
         return {plane: error for plane, error in found if error <= most and math.isfinite(error)}
 
     def several(
-        self, plane: Plane, error: float, given: Views, least: int = 2, most: float = TOLERANCE
+        self, plane: Plane, error: float, given: Views, least: int = 2, most: float = MAX_ERROR_RATIO
     ) -> tuple[Symmetry, float] | None:
         """The most likely symmetry of several planes, one of which is known, and its error divided by order**WORTH.
 
@@ -128,14 +129,14 @@ class SymmetryJudge:
         centre = self.views.bounds.centre
         apart = sum(a * b for a, b in zip(plane.normal, centre, strict=True)) - plane.offset
         x, y, z = (a - apart * b for a, b in zip(centre, plane.normal, strict=True))
-        room = min(MOST_IMAGES // len(given), MOST_PIXELS // given.images[:, 0].numel())
+        room = min(MOST_IMAGES // len(given), MAX_REFLECTED_PIXELS // given.images[:, 0].numel())
         found, best, possible = None, error, set[int]()
         for order, parts in ORDERS.items():
             symmetry = Symmetry(plane, order, (x, y, z))
             if symmetry.images > room or not possible.issuperset(parts):
                 continue
             error = self.error(symmetry)
-            if error > TOLERANCE:
+            if error > MAX_ERROR_RATIO:
                 continue
             possible.add(order)
             if order >= least and error <= most and error / order**WORTH < best:
@@ -161,13 +162,13 @@ class SymmetryJudge:
         if symmetry is not None:
             shown = images_by(views, symmetry)
             voxels = carved(shown[len(views) :], len(voxels.occupied), voxels)
-            seen, held = views.masks >= SHOWN, footprint(voxels, views.cameras)[:, None]
+            seen, held = views.masks >= MIN_OBJECT_OPACITY, footprint(voxels, views.cameras)[:, None]
             if not voxels.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
                 return math.inf
             among = held | ~seen
         assert shown.masks is not None
         planes = VisibilityPlanes(shown.images, shown.cameras, shown.masks, voxels)
-        blend = HullBlend(steps=STEPS * len(voxels.occupied)).adapt_to(planes)
+        blend = HullBlend(steps=STEPS_PER_VOXEL * len(voxels.occupied)).adapt_to(planes)
         found = self.rays.picture(blend.trace(self.rays.rays, differentiable=False).colour, views.masks.shape)
         return float((found - views.images).square().mean(1, keepdim=True)[among].sum())
 
@@ -189,10 +190,10 @@ def best_vertical_plane(judge: SymmetryJudge, views: Views) -> Plane:
         return next(iter(angles))
     first, *others = sorted(errors, key=errors.__getitem__)
     apart = [each for each in others if abs(math.sin(angles[each] - angles[first])) > math.sin(1.5 * step)]
-    likely = [first, *(each for each in apart[:1] if errors[each] <= NEARLY * errors[first])]
+    likely = [first, *(each for each in apart[:1] if errors[each] <= MAX_SECOND_ERROR_RATIO * errors[first])]
     nearer = [_refined(coarse, (angles[each], 0.0), (step / 2, 0.0), COARSE_ROUNDS) for each in likely]
     start, _ = min(nearer, key=lambda each: each[1])
-    (angle, offset), _ = _refined(judge, start, (step / 2**COARSE_ROUNDS, SPAN), FINE_ROUNDS)
+    (angle, offset), _ = _refined(judge, start, (step / 2**COARSE_ROUNDS, OFFSET_STEP), FINE_ROUNDS)
     return _vertical(views.bounds, angle, offset)
 
 

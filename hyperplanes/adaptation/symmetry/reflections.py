@@ -15,13 +15,22 @@ from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry, reflected
 from hyperplanes.rendering.footprint import footprint
 from hyperplanes.views import Views, join_views, moved
 
-__all__ = ["HULL_SIDE", "SHOWN", "UNKNOWN", "handicaps", "images_by", "reflected", "with_reflections"]
+__all__ = [
+    "HULL_SIDE",
+    "MIN_OBJECT_OPACITY",
+    "UNKNOWN_OPACITY",
+    "images_by",
+    "penalty_offsets",
+    "reflected",
+    "with_reflections",
+]
 
 HULL_SIDE = 96  # voxels an axis of the hull in which asymmetric parts are looked for
-SHOWN = 0.9  # least opacity of a mask in a pixel that shows the object
-UNKNOWN = 0.97  # opacity of pixels in which a reflection is known to be wrong: not carved, and colour not used
-HANDICAP = 0.05  # penalty of reflections as planes: light comes from one side, and writing is reversed
-ROTATED = 0.2  # the same for those about other planes, about which few objects are symmetric in every detail
+MIN_OBJECT_OPACITY = 0.9  # least opacity of a mask in a pixel that shows the object
+UNKNOWN_OPACITY = 0.97  # opacity of pixels in which a reflection is known to be wrong: not carved, and colour not used
+REFLECTION_PENALTY = 0.05  # penalty of reflections as planes: light comes from one side, and writing is reversed
+# the same for those about other planes, about which few objects are symmetric in every detail
+OTHER_PLANE_PENALTY = 0.2
 
 
 def reflected(views: Views, plane: Plane) -> Views:
@@ -47,15 +56,15 @@ def images_by(views: Views, symmetry: Symmetry) -> Views:
     return join_views(both, *(moved(both, rotation) for rotation in symmetry.rotations[1:]))
 
 
-def handicaps(given: int, symmetry: Symmetry) -> Float[Tensor, " view"]:
+def penalty_offsets(given: int, symmetry: Symmetry) -> Float[Tensor, " view"]:
     """The penalties of the views of `images_by` as planes.
 
     Args:
         given: number of views without reflections.
         symmetry: of the object.
     """
-    result = torch.full((given * symmetry.images,), ROTATED)
-    result[: 2 * given] = HANDICAP
+    result = torch.full((given * symmetry.images,), OTHER_PLANE_PENALTY)
+    result[: 2 * given] = REFLECTION_PENALTY
     result[:given] = 0.0
     return result
 
@@ -65,7 +74,7 @@ def with_reflections(support: Views, symmetry: Symmetry | None, known: Occupancy
     """The views, followed by their reflections (`images_by`).
 
     Few objects are symmetric in all parts. Whatever views show outside the visual hull of views and reflections is an
-    asymmetric part. Where it would appear in a reflection, the opacity is UNKNOWN.
+    asymmetric part. Where it would appear in a reflection, the opacity is UNKNOWN_OPACITY.
 
     Args:
         support: of an object that is symmetric, except for some parts.
@@ -81,7 +90,7 @@ def with_reflections(support: Views, symmetry: Symmetry | None, known: Occupancy
     parts = _asymmetric_parts(support, reflections, known or hull(support, HULL_SIDE))
     if parts.occupied.any():
         wrong = footprint(parts, reflections.cameras)[:, None]
-        masks = torch.where(wrong, UNKNOWN, found.masks[len(support) :])
+        masks = torch.where(wrong, UNKNOWN_OPACITY, found.masks[len(support) :])
         found = replace(found, masks=torch.cat([support.masks, masks]))
     return found
 
@@ -91,7 +100,7 @@ def _asymmetric_parts(support: Views, reflections: Views, found: Occupancy) -> O
     assert support.masks is not None
     assert reflections.masks is not None
     common = carve(reflections.masks, reflections.cameras, found.bounds, HULL_SIDE, within=found)
-    missed = (support.masks >= SHOWN) & ~footprint(common, support.cameras)[:, None]
+    missed = (support.masks >= MIN_OBJECT_OPACITY) & ~footprint(common, support.cameras)[:, None]
     points, occupied = found.centres().to(support.images), found.occupied.clone()
     where = ImagePlanes(missed.to(support.images), support.cameras, background=0.0).lookup(points).colours
     occupied[found.occupied] = where.amax(1)[:, 0] > 0.5

@@ -28,16 +28,16 @@ LEVELS = ((64, 24, 32, 100), (128, 48, 64, 120), (192, 80, 96, 120))
 """Pixels along the longer side of the pictures, cells of the inner and of the outer grid along an axis, and steps."""
 
 FEWEST_VIEWS = 5
-RAYS = 1024
+RAYS_PER_STEP = 1024
 RATE, LAST_RATE = 0.2, 0.02  # of Adam
 THIN = -4.0  # initial value of both grids, before softplus: optical depth of a cell
-SAMPLES = 1.5  # inside the sphere, per cell of its grid along an axis
+SAMPLES_PER_CELL = 1.5  # inside the sphere, per cell of its grid along an axis
 BEFORE, BEHIND = 12, 64  # samples in front of the sphere and beyond it
-NEAREST = 0.1  # where samples of a ray that misses the sphere begin: fraction of the distance to its closest point
-FARTHEST = 0.97  # where samples end: fraction of the way to infinity, in disparity
-CERTAIN = 0.02  # weight of the loss on opacities between 0 and 1
-DECIDED = 0.3  # fraction of the steps after which that loss is used
-PIXELS = 256  # along the longer side of the masks, before they are enlarged
+NEAR_SHARE = 0.1  # where samples of a ray that misses the sphere begin: fraction of the distance to its closest point
+FAR_SHARE = 0.97  # where samples end: fraction of the way to infinity, in disparity
+BINARY_LOSS_WEIGHT = 0.02  # weight of the loss on opacities between 0 and 1
+BINARY_LOSS_START = 0.3  # fraction of the steps after which that loss is used
+MASK_SIZE = 256  # along the longer side of the masks, before they are enlarged
 SHARPENED = 4.0  # slope of a mask as a function of opacity, so that soft borders do not count as the object
 RAYS_AT_ONCE = 1 << 13
 
@@ -78,7 +78,7 @@ class Separated:
         Args:
             views: photographs of the fitted scene.
         """
-        _, opacity = self.render(views.resized(PIXELS).to("cpu", torch.float32).cameras)
+        _, opacity = self.render(views.resized(MASK_SIZE).to("cpu", torch.float32).cameras)
         opacity = interpolate(opacity, views.size, mode="bilinear").to(views.images)
         masks = (SHARPENED * (opacity - 0.5) + 0.5).clamp(0, 1)
         return replace(views, images=views.images * masks + (1 - masks), masks=masks)
@@ -113,11 +113,11 @@ def separate_background(views: Views, *, on_step: Callable[[int, int], None] | N
         for _ in range(steps):
             descent.param_groups[0]["lr"] = RATE * (LAST_RATE / RATE) ** (done / total)
             # squared error of random rays; opacities between 0 and 1 are penalised once there is a shape
-            rays, truth = small.sample_rays(RAYS, generator=generator)
+            rays, truth = small.sample_rays(RAYS_PER_STEP, generator=generator)
             colour, opacity = _composited(inner, outer, rays, views.bounds, generator)
             loss = (colour - truth).square().mean()
-            if done > DECIDED * total:
-                loss = loss + CERTAIN * (opacity * (1 - opacity)).mean()
+            if done > BINARY_LOSS_START * total:
+                loss = loss + BINARY_LOSS_WEIGHT * (opacity * (1 - opacity)).mean()
             descent.zero_grad()
             loss.backward()
             descent.step()
@@ -131,7 +131,7 @@ def _composited(
     inner: Grid, outer: Grid, rays: Rays, bounds: Sphere, generator: torch.Generator | None = None
 ) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 1"]]:
     """Colours of rays through both grids, and the opacity of the inner one."""
-    count = int(SAMPLES * inner.shape[1])
+    count = int(SAMPLES_PER_CELL * inner.shape[1])
 
     def samples(number: int) -> Tensor:
         """One in each of `number` equal intervals of [0, 1], (ray, sample)."""
@@ -140,9 +140,9 @@ def _composited(
 
     # distances: in front of the sphere, inside it, and beyond it at equal steps in disparity
     near, far = rays.near[:, None], rays.far[:, None]
-    start = torch.where(far > near, (near - bounds.radius).clamp_min(0.0), NEAREST * near)
+    start = torch.where(far > near, (near - bounds.radius).clamp_min(0.0), NEAR_SHARE * near)
     around = torch.cat(
-        [start + (near - start) * samples(BEFORE), far + bounds.radius * (1 / (1 - FARTHEST * samples(BEHIND)) - 1)], 1
+        [start + (near - start) * samples(BEFORE), far + bounds.radius * (1 / (1 - FAR_SHARE * samples(BEHIND)) - 1)], 1
     )
     within = near + (far - near) * samples(count)
     # optical depth and colour there

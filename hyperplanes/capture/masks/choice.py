@@ -21,7 +21,7 @@ MASKS = ("auto", "given", "colour", "network", "grabcut", "none")
 Masker = Callable[[np.ndarray, int], np.ndarray]
 """From an image (height, width, 3) and the index of its camera to opacity (height, width) in [0, 1]."""
 
-LOOKED_AT = 12  # about how many images are checked for a plain background
+INSPECTED_IMAGES = 12  # about how many images are checked for a plain background
 
 
 def check_mask(name: str) -> None:
@@ -62,7 +62,7 @@ def choose_masker(name: str, model: SparseModel, pictures: Sequence[np.ndarray])
         ValueError: the background is not plain, and no other method that `auto` could choose is installed.
     """
     if name in ("auto", "given"):
-        step = max(1, len(pictures) // LOOKED_AT)
+        step = max(1, len(pictures) // INSPECTED_IMAGES)
         if is_plain(pictures[::step]):
             name = "colour"
         elif weights() is not None:

@@ -12,8 +12,9 @@ from hyperplanes.capture.masks.regions import cleaned, connected_regions
 
 __all__ = ["PlainBackground", "is_plain"]
 
-BORDER = 0.03  # of the shorter side: width of the border
-NEAR, FAR = 10.0, 18.0  # distances in CIE Lab up to which a pixel is background, and from which on it is the object
+BORDER_WIDTH = 0.03  # of the shorter side: width of the border
+BACKGROUND_DISTANCE = 10.0  # in CIE Lab, up to which a pixel is background
+OBJECT_DISTANCE = 18.0  # and from which on it is the object
 PLAIN_BORDER, PLAIN_PICTURES = 0.7, 0.8  # least shares of the border and of the images that have to be plain
 
 
@@ -28,11 +29,11 @@ class PlainBackground:
         """Opacity in [0, 1]."""
         lab = rgb2lab(picture)
         distance = np.linalg.norm(lab - _border_colour(lab), axis=-1)
-        opacity = ((distance - NEAR) / (FAR - NEAR)).clip(0, 1)
+        opacity = ((distance - BACKGROUND_DISTANCE) / (OBJECT_DISTANCE - BACKGROUND_DISTANCE)).clip(0, 1)
         labels, _ = connected_regions(opacity < 0.5)
         outer = np.unique(labels[_border(labels.shape)])
         reached = np.isin(labels, outer[outer > 0])
-        enclosed = (opacity < 0.5) & ~reached & (distance > NEAR / 2)  # holes are closer
+        enclosed = (opacity < 0.5) & ~reached & (distance > BACKGROUND_DISTANCE / 2)  # holes are closer
         return cleaned(np.where(enclosed, 1.0, opacity))
 
 
@@ -42,13 +43,14 @@ def is_plain(pictures: Sequence[UInt8[np.ndarray, "height width 3"]]) -> bool:
     for picture in pictures:
         lab = rgb2lab(picture[:: max(1, min(picture.shape[:2]) // 200), :: max(1, min(picture.shape[:2]) // 200)])
         border = lab[_border(lab.shape[:2])]
-        plain += float((np.linalg.norm(border - _border_colour(lab), axis=-1) < NEAR).mean()) >= PLAIN_BORDER
+        distance = np.linalg.norm(border - _border_colour(lab), axis=-1)
+        plain += float((distance < BACKGROUND_DISTANCE).mean()) >= PLAIN_BORDER
     return plain >= PLAIN_PICTURES * len(pictures)
 
 
 def _border(size: tuple[int, ...]) -> np.ndarray:
-    """Which pixels belong to the border, of a width of BORDER."""
-    width = max(1, round(BORDER * min(size[:2])))
+    """Which pixels belong to the border, of a width of BORDER_WIDTH."""
+    width = max(1, round(BORDER_WIDTH * min(size[:2])))
     result = np.ones(size[:2], bool)
     result[width:-width, width:-width] = False
     return result

@@ -18,7 +18,7 @@ from hyperplanes.utilities.files.reading import DataError
 
 __all__ = ["Command"]
 
-LONGEST = 600  # seconds: time limit for one image
+TIMEOUT_SECONDS = 600  # seconds: time limit for one image
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Command:
             ]
             try:
                 done = subprocess.run(
-                    words, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False
+                    words, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_SECONDS, check=False
                 )
             except (OSError, subprocess.TimeoutExpired) as error:
                 raise ValueError(f"--mask: expected a program that runs, found {error}; check {self.line!r}") from error

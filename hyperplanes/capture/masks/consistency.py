@@ -25,10 +25,10 @@ from hyperplanes.utilities.images.sizes import scaled_size
 
 __all__ = ["Agreement", "agree"]
 
-COARSE, FINE = 80, 120  # voxels per axis: of the first hull, and of the one that masks are compared with
-LONGEST = 240  # pixels along the longer side of the masks that are compared
-FEWEST = 8  # views; with fewer, masks are not compared
-SEEN = 0.25  # of the views: the least share that must show a voxel within their borders
+COARSE_SIDE, FINE_SIDE = 80, 120  # voxels per axis: of the first hull, and of the one that masks are compared with
+MAX_MASK_SIZE = 240  # pixels along the longer side of the masks that are compared
+MIN_MASKS = 8  # views; with fewer, masks are not compared
+MIN_VIEW_SHARE = 0.25  # of the views: the least share that must show a voxel within their borders
 MOST_VOTES = 0.125  # of the views
 SETTLED = 0.01  # least gain in intersection over union for which more votes are taken
 ZOOM = 1.15  # radii of the first hull: the sphere in which it is carved again
@@ -97,17 +97,17 @@ def agree(
     """
     small = [_reduced(mask) for mask in masks]
     pairs = [(each, _camera(model, row, masks[row], each.shape)) for row, each in enumerate(small)]
-    grid = _voxel_votes(pairs, sphere, COARSE)
+    grid = _voxel_votes(pairs, sphere, COARSE_SIDE)
     votes = _votes(grid, pairs)
     hull = grid.hull(votes)
     ball = _ball(hull)
     if ball is not None:  # the same again, finer
-        grid = _voxel_votes(pairs, Sphere(ball.centre, min(ZOOM * ball.radius, sphere.radius)), FINE)
+        grid = _voxel_votes(pairs, Sphere(ball.centre, min(ZOOM * ball.radius, sphere.radius)), FINE_SIDE)
         votes = _votes(grid, pairs)
         hull = grid.hull(votes)
     if not hull.occupied.any():
         return Agreement(list(masks), np.zeros(len(masks)), votes, None)
-    if len(masks) < FEWEST:
+    if len(masks) < MIN_MASKS:
         return Agreement(list(masks), np.zeros(len(masks)), votes, hull)
     surrounded = _is_surrounded(model, hull.bounds)
     mended, disagreement, outlines = [], [], []
@@ -126,9 +126,9 @@ def agree(
 
 
 def _reduced(mask: Mask) -> Bool[np.ndarray, "row column"]:
-    """A mask reduced to at most LONGEST pixels along its longer side."""
+    """A mask reduced to at most MAX_MASK_SIZE pixels along its longer side."""
     picture = Image.fromarray(mask.astype(np.float32))
-    return np.asarray(picture.resize(scaled_size(picture.size, LONGEST), Image.Resampling.BOX)) > 0.4
+    return np.asarray(picture.resize(scaled_size(picture.size, MAX_MASK_SIZE), Image.Resampling.BOX)) > 0.4
 
 
 def _camera(model: SparseModel, row: int, mask: Mask, size: tuple[int, ...]) -> PinholeCamera:
@@ -162,7 +162,7 @@ def _voxel_votes(pairs: Sequence[tuple[np.ndarray, PinholeCamera]], sphere: Sphe
     ruled = torch.stack([_ruled_out(mask, one, sphere, side) for mask, one in pairs])
     # an image shows those voxels within its borders that an empty mask would rule out; half the resolution suffices
     shown = sum((_ruled_out(np.zeros_like(mask), one, sphere, side // 2).int() for mask, one in pairs), torch.zeros(()))
-    candidate = shown >= max(2.0, SEEN * len(pairs))
+    candidate = shown >= max(2.0, MIN_VIEW_SHARE * len(pairs))
     for axis in range(3):
         candidate = candidate.repeat_interleave(2, axis)
     return _VoxelVotes(ruled, candidate, sphere)

@@ -18,10 +18,10 @@ from hyperplanes.utilities.images.sizes import scaled_size
 
 __all__ = ["GrabCut", "extended"]
 
-LONGEST = 320  # pixels along the longer side of the images that are segmented
-SEED = 0.012  # of the longer side: radius of the disc that is labelled around a point
-STEPS = 5  # iterations of GrabCut
-CERTAIN = 0.03  # of the square root of a mask's area: pixels further inside than this surely belong to the object
+MAX_IMAGE_SIZE = 320  # pixels along the longer side of the images that are segmented
+SEED_RADIUS = 0.012  # of the longer side: radius of the disc that is labelled around a point
+GRABCUT_ITERATIONS = 5  # iterations of GrabCut
+CERTAIN_DEPTH = 0.03  # of the square root of a mask's area: pixels further inside than this surely belong to the object
 
 
 class GrabCut:
@@ -39,7 +39,7 @@ class GrabCut:
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"], camera: int) -> Float[np.ndarray, "height width"]:
         """Opacity in [0, 1]."""
-        size = scaled_size(picture.shape[1::-1], LONGEST)
+        size = scaled_size(picture.shape[1::-1], MAX_IMAGE_SIZE)
         labels = self._seeds(camera, size, max(size) / max(picture.shape[:2]))
         if not (labels == self._cv2.GC_FGD).any():
             return np.zeros(picture.shape[:2])
@@ -58,7 +58,7 @@ class GrabCut:
         labels[from_middle < reach] = self._cv2.GC_PR_BGD
         labels[from_middle < 0.5 * reach] = self._cv2.GC_PR_FGD
         seen = self._model.observed[self._model.observed[:, 0] == camera, 1]
-        radius = max(1, round(SEED * max(size)))
+        radius = max(1, round(SEED_RADIUS * max(size)))
         for chosen, label in ((False, self._cv2.GC_BGD), (True, self._cv2.GC_FGD)):
             points = self._model.points[seen[self._chosen[seen] == chosen]]
             places, front = self._model.project(camera, points)
@@ -83,9 +83,9 @@ def extended(
         Opacity in [0, 1].
     """
     cv2 = require("cv2", "completes masks by colour")
-    size = scaled_size(picture.shape[1::-1], LONGEST)
+    size = scaled_size(picture.shape[1::-1], MAX_IMAGE_SIZE)
     likely, allowed = (np.asarray(_resized(values, size) > 0.5) for values in (mask, possible))
-    depth = max(1, round(CERTAIN * float(np.sqrt(likely.sum()))))
+    depth = max(1, round(CERTAIN_DEPTH * float(np.sqrt(likely.sum()))))
     certain = np.asarray(ndimage.binary_erosion(likely, iterations=depth), bool)
     labels = np.full(certain.shape, cv2.GC_BGD)
     for where, label in ((allowed, cv2.GC_PR_BGD), (likely, cv2.GC_PR_FGD), (certain, cv2.GC_FGD)):
@@ -95,7 +95,7 @@ def extended(
     return np.maximum(mask, _cut(picture, labels.astype(np.uint8), 2))
 
 
-def _cut(picture: np.ndarray, labels: np.ndarray, steps: int = STEPS) -> np.ndarray:
+def _cut(picture: np.ndarray, labels: np.ndarray, steps: int = GRABCUT_ITERATIONS) -> np.ndarray:
     """Opacity of the image by GrabCut, from initial labels in a lower resolution."""
     cv2 = require("cv2", "finds masks by GrabCut")
     small = np.asarray(Image.fromarray(picture).resize(labels.shape[::-1], Image.Resampling.BOX))

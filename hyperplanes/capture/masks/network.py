@@ -22,7 +22,7 @@ from hyperplanes.capture.packages import is_installed, require
 
 __all__ = ["SalientObject", "weights"]
 
-SIDE = 320  # pixels along each side of the network's input
+INPUT_SIZE = 320  # pixels along each side of the network's input
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, by which the input is normalised
 
 
@@ -71,7 +71,9 @@ class SalientObject:
 
     def _probability(self, picture: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "side side"]:
         """The probability that each pixel of the scaled image belongs to the object, stretched to [0, 1]."""
-        small = np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.LANCZOS), np.float32)
+        small = np.asarray(
+            Image.fromarray(picture).resize((INPUT_SIZE, INPUT_SIZE), Image.Resampling.LANCZOS), np.float32
+        )
         small = (small / max(1.0, float(small.max())) - MEAN) / DEVIATION
         read = small.transpose(2, 0, 1)[None].astype(np.float32)
         session = self._session

@@ -27,7 +27,7 @@ from hyperplanes.views import Views
 
 __all__ = ["keep_field", "keep_tensors", "kept_file", "kept_folder", "recall_field", "recall_tensors"]
 
-MOST = 10  # entries of a kind; the oldest is deleted first
+MAX_ENTRIES = 10  # entries of a kind; the oldest is deleted first
 
 
 def kept_folder(model: HyperPlanes, views: Views, steps: Steps, settings: FineTuning) -> Path:
@@ -108,7 +108,7 @@ def _parts(views: Views) -> Iterator[Tensor]:
 
 def _delete_oldest(folder: Path) -> None:
     others = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
-    for path in others[:-MOST]:
+    for path in others[:-MAX_ENTRIES]:
         shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 

@@ -16,7 +16,7 @@ from hyperplanes.views import Views
 __all__ = ["check_duplicates", "check_gaze", "check_masks", "check_poses", "check_splits"]
 
 PARALLEL = 1e-6  # from 1, the cosine of the angle between two axes: 0.08 degrees
-SAME = 1e-6  # largest difference between the entries of two poses that count as one
+SAME_POSE_TOLERANCE = 1e-6  # largest difference between the entries of two poses that count as one
 
 
 def check_duplicates(views: Views) -> str | None:
@@ -40,7 +40,7 @@ def check_duplicates(views: Views) -> str | None:
 def check_poses(views: Views) -> str | None:
     """A sentence where more than half of three or more views have one and the same pose, otherwise None."""
     pose = camera.camera_from_world(views.cameras).reshape(len(views), -1)
-    same = int((torch.cdist(pose, pose, p=torch.inf) < SAME).sum(1).max())
+    same = int((torch.cdist(pose, pose, p=torch.inf) < SAME_POSE_TOLERANCE).sum(1).max())
     if len(views) < 3 or 2 * same <= len(views):
         return None
     return (

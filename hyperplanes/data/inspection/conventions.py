@@ -32,7 +32,7 @@ CLEARLY = 0.15
 LEAST_COVERAGE = 0.83  # of the masks by their hull: 0.86 to 0.95 with right poses, 0.24 to 0.80 with wrong ones
 FEWEST_MATCHES = 30
 FEWEST_VIEWS = 3  # two masks are silhouettes of a hull under nearly any poses
-NEAR = 2.0  # pixels of 256 from the epipolar line
+EPIPOLAR_TOLERANCE = 2.0  # pixels of 256 from the epipolar line
 MATCHING, RANDOM = 0.6, 0.3  # of the matches are near with right poses, and at most that many with wrong ones
 
 
@@ -133,7 +133,7 @@ def _by_pictures(views: Views, without: str) -> Conventions:
 
 def near_lines(matches: Matches, pose: Tensor) -> float:
     """The fraction of matches that are on their epipolar lines."""
-    return float((matches.errors(pose) < NEAR).double().mean())
+    return float((matches.errors(pose) < EPIPOLAR_TOLERANCE).double().mean())
 
 
 def _clearly_best(scores: dict[str, float]) -> str:

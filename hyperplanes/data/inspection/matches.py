@@ -23,12 +23,12 @@ from hyperplanes.views import Views
 
 __all__ = ["Matches", "match_pictures", "sampson"]
 
-LARGEST = 256  # pixels along the longer side at which corners are looked for
+MAX_IMAGE_SIZE = 256  # pixels along the longer side at which corners are looked for
 CORNERS = 300  # a picture
-REACH = 6  # pixels on each side of a corner that are compared
+PATCH_RADIUS = 6  # pixels on each side of a corner that are compared
 LIKE, LIKELIER = 0.8, 0.8  # least correlation of two corners, and how much nearer to 1 it is than the second best
-FARTHEST = 25.0  # degrees between the axes of a pair; corners look different beyond
-PAIRS = 10
+MAX_PAIR_ANGLE = 25.0  # degrees between the axes of a pair; corners look different beyond
+MAX_PAIRS = 10
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def match_pictures(views: Views, across: Bool[Tensor, " view"] | None = None) ->
         across: match only pairs of which one view is in this set and the other is not.
 
     Returns:
-        The matches of up to PAIRS pairs; none where no two views look alike.
+        The matches of up to MAX_PAIRS pairs; none where no two views look alike.
     """
     axes = normalize(camera.viewing_directions(views.cameras).double(), dim=-1)
     alike = axes @ axes.T
@@ -74,11 +74,11 @@ def match_pictures(views: Views, across: Bool[Tensor, " view"] | None = None) ->
     if across is not None:
         alike[across[:, None] == across[None]] = -2.0
     nearest = alike.argmax(1).tolist()
-    least = math.cos(math.radians(FARTHEST))
+    least = math.cos(math.radians(MAX_PAIR_ANGLE))
     pairs = {(min(a, b), max(a, b)) for a, b in enumerate(nearest) if alike[a, b] > least}
     chosen = sorted(pairs, key=lambda pair: -float(alike[pair]))
-    chosen = chosen[:: max(1, len(chosen) // PAIRS)][:PAIRS]
-    size = scaled_size(views.size, LARGEST)
+    chosen = chosen[:: max(1, len(chosen) // MAX_PAIRS)][:MAX_PAIRS]
+    size = scaled_size(views.size, MAX_IMAGE_SIZE)
     cameras = camera.resized(views.cameras, *size)
     corners = {view: _corners(views.images[view], size) for view in sorted({view for pair in chosen for view in pair})}
     found = [_matched(corners[a], corners[b]) for a, b in chosen]
@@ -114,16 +114,16 @@ def _corners(image: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Pixels (corner, 2) of the strongest corners, and what surrounds them, with mean 0 and length 1."""
     grey = interpolate(image.float().cpu().mean(0)[None, None], size, mode="area")
     height, width = size
-    border = REACH + 1
+    border = PATCH_RADIUS + 1
     if min(size) <= 2 * border:
-        return torch.zeros(0, 2), torch.zeros(0, (2 * REACH + 1) ** 2)
+        return torch.zeros(0, 2), torch.zeros(0, (2 * PATCH_RADIUS + 1) ** 2)
     strength = gftt_response(grey)
     strength = strength * (strength == max_pool2d(strength, 5, 1, 2))
     strength = strength[0, 0, border:-border, border:-border]
     best = strength.flatten().topk(min(CORNERS, strength.numel()))
     index = best.indices[best.values > 1e-6]
     pixels = torch.stack([index % strength.shape[1], index // strength.shape[1]], -1).float() + border
-    offset = torch.arange(-REACH, REACH + 1.0)
+    offset = torch.arange(-PATCH_RADIUS, PATCH_RADIUS + 1.0)
     around = torch.cartesian_prod(offset, offset)
     grid = (pixels[:, None] + around) / torch.tensor([(width - 1) / 2, (height - 1) / 2]) - 1
     patches = grid_sample(grey, grid[None], align_corners=True)[0, 0]

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from hyperplanes.data.inspection.scene import NEAR, WORST, SceneReport, angles_to
+from hyperplanes.data.inspection.scene import COVERAGE_ANGLE, WORST, SceneReport, angles_to
 from hyperplanes.utilities.images.plots import encode_figure, new_figure
 from hyperplanes.views import Views
 
 __all__ = ["draw_coverage"]
 
-STEP = 3  # degrees
-FARTHEST = 90.0  # degrees from the nearest view at which the scale of colours ends
+GRID_DEGREES = 3  # degrees
+MAX_COLOUR_ANGLE = 90.0  # degrees from the nearest view at which the scale of colours ends
 
 
 def draw_coverage(report: SceneReport, views: Views) -> bytes:
@@ -42,13 +42,18 @@ def draw_coverage(report: SceneReport, views: Views) -> bytes:
 
 
 def _draw_map(axes: Any, report: SceneReport) -> None:
-    azimuth, elevation = np.radians(np.arange(0, 360 + STEP, STEP)), np.radians(np.arange(-90, 90 + STEP, STEP))
+    azimuth, elevation = (
+        np.radians(np.arange(0, 360 + GRID_DEGREES, GRID_DEGREES)),
+        np.radians(np.arange(-90, 90 + GRID_DEGREES, GRID_DEGREES)),
+    )
     across, up = np.meshgrid(azimuth, elevation)
     flat = torch.from_numpy(_unit(across.ravel(), up.ravel()))
     stand = np.array([view.direction for view in report.views])
     angles = angles_to(torch.from_numpy(_unit(*np.radians(stand.T))), flat).reshape(across.shape).numpy()
-    image = axes.pcolormesh(np.degrees(azimuth), np.degrees(elevation), angles, cmap="viridis_r", vmin=0, vmax=FARTHEST)
-    axes.contour(np.degrees(azimuth), np.degrees(elevation), angles, [NEAR], colors="white", linewidths=1)
+    image = axes.pcolormesh(
+        np.degrees(azimuth), np.degrees(elevation), angles, cmap="viridis_r", vmin=0, vmax=MAX_COLOUR_ANGLE
+    )
+    axes.contour(np.degrees(azimuth), np.degrees(elevation), angles, [COVERAGE_ANGLE], colors="white", linewidths=1)
     faulty = np.array([bool(view.faults) for view in report.views])
     axes.scatter(*stand[~faulty].T, s=18, c="white", edgecolors="black", linewidths=0.7)
     axes.scatter(*stand[faulty].T, s=28, c="tab:red", edgecolors="black", linewidths=0.7)
@@ -56,7 +61,8 @@ def _draw_map(axes: Any, report: SceneReport) -> None:
         axes.annotate(view.name, view.direction, textcoords="offset points", xytext=(5, 4), fontsize=7)
     axes.set(xlabel="azimuth in degrees", ylabel="elevation in degrees", xlim=(0, 360), ylim=(-90, 90))
     axes.set_title(
-        f"{report.covered:.0%} of all directions lie within {NEAR:.0f} degrees of a view (inside the white line)",
+        f"{report.covered:.0%} of all directions lie within {COVERAGE_ANGLE:.0f} degrees of a view "
+        "(inside the white line)",
         fontsize=11,
     )
     axes.figure.colorbar(image, ax=axes, label="degrees to the nearest view")

@@ -26,18 +26,19 @@ from hyperplanes.geometry.poses import fibonacci_sphere
 from hyperplanes.utilities.images.sizes import scaled_size
 from hyperplanes.views import Views
 
-__all__ = ["NEAR", "WORST", "SceneReport", "ViewReport", "angles_to", "describe_scene", "stand_upright"]
+__all__ = ["COVERAGE_ANGLE", "WORST", "SceneReport", "ViewReport", "angles_to", "describe_scene", "stand_upright"]
 
-NEAR = 30.0  # degrees: a side of the object is shown where a camera stands within them
-DIRECTIONS = 2000
-MASK, SIDE, FEWEST = 96, 48, 8  # pixels and voxels of the hull that masks are compared with, and views it takes
+COVERAGE_ANGLE = 30.0  # degrees: a side of the object is shown where a camera stands within them
+COVERAGE_DIRECTIONS = 2000
+MASK_SIZE, HULL_SIDE = 96, 48  # pixels, and voxels of the hull, at which masks are compared with it
+MIN_VIEWS = 8  # for this hull
 FACING = 0.2  # cosine between a surface and what sees it
 STEEP = 70.0  # degrees of elevation above which azimuth says little
-UNLIKE = 0.15  # of intersection over union below the median: a mask that fits the others' hull badly
-BLURRED = 0.5  # of the sharpness of the nearest views
+MAX_OVERLAP_DEFICIT = 0.15  # of intersection over union below the median: a mask that fits the others' hull badly
+MIN_RELATIVE_SHARPNESS = 0.5  # of the sharpness of the nearest views
 LONELY = 1.5  # times the usual angle to the nearest view
 LARGE_ERROR = 2.0  # times the median reprojection error
-SHARP = 256  # pixels along the longer side, on which sharpness is judged
+SHARPNESS_SIZE = 256  # pixels along the longer side, on which sharpness is judged
 WORST = 5
 
 
@@ -70,7 +71,7 @@ class SceneReport:
 
     Attributes:
         views: one each, in their order.
-        covered: share of all directions with a view within NEAR degrees.
+        covered: share of all directions with a view within COVERAGE_ANGLE degrees.
         above: share of those more than 45 degrees above the horizon.
         below: share of those more than 45 degrees below it.
         gap: the widest gap in azimuth, in degrees, and the views on both sides of it; None of fewer than three views.
@@ -110,11 +111,11 @@ class SceneReport:
         """The report for people, a line a fact."""
         elevations = [view.direction[1] for view in self.views]
         lines = [
-            f"coverage: {self.covered:.0%} of all directions have a view within {NEAR:.0f} degrees ({self.above:.0%} "
-            f"of those from above, {self.below:.0%} of those from below); the views stand "
+            f"coverage: {self.covered:.0%} of all directions have a view within {COVERAGE_ANGLE:.0f} degrees "
+            f"({self.above:.0%} of those from above, {self.below:.0%} of those from below); the views stand "
             f"{_elevation(min(elevations))} to {_elevation(max(elevations))} the horizon"
         ]
-        if self.gap is not None and self.gap[0] > 2 * NEAR:
+        if self.gap is not None and self.gap[0] > 2 * COVERAGE_ANGLE:
             width, left, right = self.gap
             lines.append(f"gap: nothing was seen from {width:.0f} degrees around between {left} and {right}")
         apart = [view.neighbour for view in self.views]
@@ -163,10 +164,10 @@ class SceneReport:
             text = "good pictures from all sides"
         else:
             text = f"good pictures from where the views stand; {1 - self.covered:.0%} of the directions are guessed"
-        if len(self.views) < FEWEST:
+        if len(self.views) < MIN_VIEWS:
             text += f"; {len(self.views)} views are few, 20 or more show details"
         apart = median(view.neighbour for view in self.views)
-        if apart > NEAR:
+        if apart > COVERAGE_ANGLE:
             text += f"; views {apart:.0f} degrees apart share little, details will be soft"
         return text
 
@@ -191,7 +192,7 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
     hull = _hull(views)
     agreement = None
     if hull is not None:
-        agreement = CoarseHull(hull.centres(), hull).overlap(*small_masks(views, MASK, len(views)))
+        agreement = CoarseHull(hull.centres(), hull).overlap(*small_masks(views, MASK_SIZE, len(views)))
     middle = None if agreement is None else float(agreement.median())
     sharp = _sharpness(views, apart)
     cut = cut_off(views.masks) if views.masks is not None else torch.zeros(len(views), dtype=torch.bool)
@@ -205,21 +206,21 @@ def describe_scene(views: Views, sparse: SparsePoints | None = None) -> SceneRep
         fit = None if agreement is None else float(agreement[index])
         faults = ["the mask seems to show the background"] if background[index] else []
         faults += ["the mask is empty"] if empty[index] else []
-        if not faults and fit is not None and middle is not None and fit < middle - UNLIKE:
+        if not faults and fit is not None and middle is not None and fit < middle - MAX_OVERLAP_DEFICIT:
             faults.append(f"mask and the hull of all masks agree by {fit:.0%}, in the median {middle:.0%}")
-        if float(sharp[index]) < BLURRED:
+        if float(sharp[index]) < MIN_RELATIVE_SHARPNESS:
             faults.append(f"blurred, {float(sharp[index]):.0%} as sharp as the views beside it")
         error = errors.get(written[index])
         if error is not None and usual is not None and error > max(1.0, LARGE_ERROR * usual):
             faults.append(f"reprojection error {error:.1f} pixels, in the median {usual:.1f}")
         nearest = float(nearests[index])
-        if nearest > max(NEAR, LONELY * float(nearests.median())):
+        if nearest > max(COVERAGE_ANGLE, LONELY * float(nearests.median())):
             faults.append(f"no other within {nearest:.0f} degrees")
         direction = float(azimuth[index]), float(elevation[index])
         reports.append(ViewReport(name, direction, nearest, fit, error, bool(cut[index]), tuple(faults)))
     # how much of all directions, from above and from below, some view covers
-    every = torch.linalg.inv(fibonacci_sphere(DIRECTIONS, 1.0).double())[:, :3, 3]
-    near = angles_to(axes, every) < NEAR
+    every = torch.linalg.inv(fibonacci_sphere(COVERAGE_DIRECTIONS, 1.0).double())[:, :3, 3]
+    near = angles_to(axes, every) < COVERAGE_ANGLE
     up = torch.rad2deg(torch.asin(every[:, 1].clamp(-1, 1)))
     shown = None if hull is None else _shown(views, hull)
     return SceneReport(
@@ -280,7 +281,9 @@ def _hull(views: Views) -> Occupancy | None:
     if not masks_tell(views):
         return None
     views = with_object(views)
-    hull = carve(*small_masks(views, MASK, len(views)), views.bounds, SIDE, votes=2 if len(views) >= FEWEST else 1)
+    hull = carve(
+        *small_masks(views, MASK_SIZE, len(views)), views.bounds, HULL_SIDE, votes=2 if len(views) >= MIN_VIEWS else 1
+    )
     return hull if hull.occupied.any() else None
 
 
@@ -310,7 +313,7 @@ def _sharpness(views: Views, apart: Tensor) -> Float[Tensor, " view"]:
     Of small grey pictures, the mean absolute Laplacian over the mean absolute gradient, within the mask: blur takes
     from the one more than from the other, distance and contrast hardly matter.
     """
-    size = [max(3, side) for side in scaled_size(views.size, SHARP)]
+    size = [max(3, side) for side in scaled_size(views.size, SHARPNESS_SIZE)]
     grey = interpolate(views.images.mean(1, keepdim=True), size, mode="area")
     inside = torch.ones_like(grey) if views.masks is None else interpolate(views.masks, size, mode="area")
     inside = 1 - torch.nn.functional.max_pool2d(1 - inside, 3, 1, 1)[:, :, 1:-1, 1:-1]  # away from the outline

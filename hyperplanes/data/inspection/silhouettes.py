@@ -10,7 +10,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from hyperplanes.data.pictures.bounds import OFTEN_CUT, ROOM, are_shown, cut_off, empty_masks, estimate_bounds
+from hyperplanes.data.pictures.bounds import OFTEN_CUT, SEARCH_RADII, are_shown, cut_off, empty_masks, estimate_bounds
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Sphere
@@ -18,7 +18,7 @@ from hyperplanes.views import Views
 
 __all__ = ["CoarseHull", "coarse_hull", "masks_tell", "silhouettes", "small_masks", "with_object"]
 
-SIDE = 32
+HULL_SIDE = 32
 MASK = 64
 MOST_VIEWS = 16
 
@@ -75,10 +75,10 @@ def coarse_hull(masks: Float[Tensor, "view 1 height width"], cameras: PinholeCam
     hull = nothing
     ends = cut_off(masks)
     cut = float(ends.float().mean()) > OFTEN_CUT
-    sphere = Sphere(sphere.centre, ROOM * sphere.radius) if cut else sphere
+    sphere = Sphere(sphere.centre, SEARCH_RADII * sphere.radius) if cut else sphere
     # each time in the sphere around what the last hull was
     for _ in range(3 if cut else 2):
-        grid = carve(masks, cameras, sphere, SIDE)
+        grid = carve(masks, cameras, sphere, HULL_SIDE)
         points = grid.centres()
         points = points[sphere.normalise(points).norm(dim=-1) <= 1]
         points = points[are_shown(points, cameras, ends)] if cut else points

@@ -20,7 +20,7 @@ from hyperplanes.utilities.files.reading import DataError
 __all__ = [
     "OFTEN_CUT",
     "ONE_PLACE",
-    "ROOM",
+    "SEARCH_RADII",
     "are_shown",
     "cut_off",
     "empty_masks",
@@ -36,13 +36,14 @@ HULL_MARGIN = 1.05
 FEWEST_MASKS = 3
 MOST_MASKS = 24  # views used: the hull of fewer views is only larger
 LARGEST_MASK = 256
-BORDER = 0.9  # of the pixels at the image border, which an inverted mask covers at least
-SMALLEST = 0.01  # least share of an image that an object covers, for its mask to be recognised as inverted
+MIN_BORDER_COVERAGE = 0.9  # of the pixels at the image border, which an inverted mask covers at least
+MIN_OBJECT_COVERAGE = 0.01  # least share of an image that an object covers, for its mask to be recognised as inverted
 OFTEN_CUT = 0.1  # of the masks: a larger share at the border of their image counts as a scene of close-ups
-ROOM = 3.0  # radii of the sphere from the cameras: where the hull of such a scene is searched
+SEARCH_RADII = 3.0  # radii of the sphere from the cameras: where the hull of such a scene is searched
 SMALLEST_DISTANCE = 1e-6  # of a camera from the centre, in units of the largest distance of one from their mean
 ONE_PLACE = 2.0**-21  # of the distance from the origin: float32 rounding moves cameras at one position this far apart
-WHOLE, SHOWN = 0.9, 0.25  # of the images that show the object whole, or of all images, that must show a point
+# of the images that show the object whole, or of all images, that must show a point
+MIN_WHOLE_SHARE, MIN_SHOWN_SHARE = 0.9, 0.25
 
 
 def estimate_bounds(
@@ -85,7 +86,7 @@ def estimate_bounds(
     masks, small = _reduced(alpha[chosen], camera.select(cameras, chosen))
     ends = cut_off(masks)
     cut = float(ends.float().mean()) > OFTEN_CUT
-    sphere = largest = Sphere(outer.centre, ROOM * outer.radius) if cut else outer
+    sphere = largest = Sphere(outer.centre, SEARCH_RADII * outer.radius) if cut else outer
     for _ in range(3 if cut else 2):
         points = carve(masks, small, sphere, HULL_SIDE).centres()
         points = points[sphere.normalise(points).norm(dim=-1) <= 1]
@@ -128,7 +129,7 @@ def inverted(
     """
     opaque = masks[:, 0] > (127 if masks.dtype == torch.uint8 else 0.5)
     border = torch.cat([opaque[:, 0], opaque[:, -1], opaque[:, :, 0], opaque[:, :, -1]], -1).float().mean(-1)
-    found = (border > BORDER) & (opaque.flatten(1).float().mean(-1) < border - SMALLEST)
+    found = (border > MIN_BORDER_COVERAGE) & (opaque.flatten(1).float().mean(-1) < border - MIN_OBJECT_COVERAGE)
     most = 2 * int(found.sum()) > len(masks)
     if most or (found.any() and 2 * int(cut_off(masks[~found]).sum()) < int((~found).sum())):
         return found
@@ -158,7 +159,7 @@ def are_shown(
         front = seen[:, 2] > 0
         column, row = (seen[:, :2] / torch.where(front, seen[:, 2], 1.0)[:, None]).unbind(-1)
         count += front & (column > 0) & (row > 0) & (column < width - 1) & (row < height - 1)
-    return count >= max(2.0, (WHOLE if whole else SHOWN) * len(matrices))
+    return count >= max(2.0, (MIN_WHOLE_SHARE if whole else MIN_SHOWN_SHARE) * len(matrices))
 
 
 def stated_bounds(document: dict[str, Any], path: Path) -> Sphere | None:

@@ -36,7 +36,7 @@ __all__ = ["MEGAPIXEL", "Frame", "Listing", "assemble", "centred_matrix", "scale
 MEGAPIXEL = 2**20
 """Photographs with more pixels are scaled down unless the caller gives a factor."""
 
-ENOUGH = 2 / 3  # of the frames of a file: the least share with an image
+MIN_IMAGE_SHARE = 2 / 3  # of the frames of a file: the least share with an image
 ROUNDING = 1.01  # pixels: largest difference between the size of a scaled image, in whole pixels, and the exact size
 
 
@@ -175,7 +175,7 @@ def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tup
     notes = []
     if missing and complete:
         raise DataError(missing[0].path, "an image", "nothing", "generate or copy the data set again")
-    if missing and len(there) < ENOUGH * len(frames):
+    if missing and len(there) < MIN_IMAGE_SHARE * len(frames):
         raise DataError(
             source,
             f"images for at least two thirds of its {len(frames)} frames",

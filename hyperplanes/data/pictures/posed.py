@@ -24,7 +24,7 @@ from hyperplanes.views import Task, Views
 
 __all__ = ["Posed", "PosedTask", "check_pose", "posed"]
 
-FARTHEST = 1e3  # extents of a scene: its largest distance from the origin at which float32 is exact to 0.1 pixels
+MAX_EXTENTS = 1e3  # of a scene: its largest distance from the origin at which float32 is exact to 0.1 pixels
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ def _far_offset(camera_from_world: npt.NDArray[np.float64], bounds: Sphere | Non
     middle = np.median(centres, axis=0)
     extent = max(float(np.abs(centres - middle).max()), 0.0 if bounds is None else bounds.radius)
     far = float(np.abs(middle).max())
-    if far <= FARTHEST * extent or extent <= ONE_PLACE * far:
+    if far <= MAX_EXTENTS * extent or extent <= ONE_PLACE * far:
         return np.zeros(3)
     step = 2.0 ** (math.floor(math.log2(far)) - 14)
     return np.round(middle / step) * step + 0.0

@@ -13,17 +13,17 @@ from kornia.geometry.camera import PinholeCamera
 from PIL import Image
 
 from hyperplanes.adaptation.checkpoints import find_checkpoint, packaged_folder
-from hyperplanes.adaptation.correction.held_out import FEWEST
+from hyperplanes.adaptation.correction.held_out import MIN_VIEWS
 from hyperplanes.adaptation.diagnostics import Diagnostics
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.data.dataset import read_task
 from hyperplanes.data.packaged import EXAMPLES
-from hyperplanes.data.support import Shown
+from hyperplanes.data.support import FarthestSupport
 from hyperplanes.evaluation import Score
 from hyperplanes.experiments.demonstration.settings import (
     BASELINES,
     MODELS,
-    PACKAGED,
+    PACKAGED_MODEL,
     QUERY_VIEWS,
     DemoSettings,
     describe_row,
@@ -69,7 +69,7 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
     for on in dict.fromkeys(cell.on for cell in settings.packaged.cells):
         cells = [cell for cell in settings.packaged.cells if cell.on == on]
         for name in runner.data.evaluated(on, "all", settings.packaged.objects):
-            task = Shown(runner.data.tasks(on), most, QUERY_VIEWS).task(name)
+            task = FarthestSupport(runner.data.tasks(on), most, QUERY_VIEWS).task(name)
             shown = next(runner.pictures(cell, name) for cell in cells if cell.orbit)
             around = np.stack([_read(frame) for frame in picture_paths(settings.first_frames, shown / ORBIT)])
             read, query = range(len(task.support)), range(len(task.query))
@@ -78,7 +78,7 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
     height, width = task.query.size
     page = Report(
         title=TITLE,
-        lead=f"The packaged model {PACKAGED!r} reads posed images of an object, any number of them from any "
+        lead=f"The packaged model {PACKAGED_MODEL!r} reads posed images of an object, any number of them from any "
         "viewpoints, and predicts the weights of a field, which is rendered from new viewpoints. Nothing was trained "
         "for this page.",
         figures=[
@@ -93,15 +93,16 @@ def write_first_page(path: Path, runner: Runner, settings: DemoSettings, scores:
         curves={},
         tuning={},
         diagnostics="",
-        facts=[("weights", f"{PACKAGED}, which comes with the package"), ("objects", ", ".join(names))],
+        facts=[("weights", f"{PACKAGED_MODEL}, which comes with the package"), ("objects", ", ".join(names))],
         commands=[
             (
                 "a turntable of your own posed images (a folder with transforms.json)",
-                f"hyperplanes render --checkpoint {PACKAGED} --views scene --out new-views --orbit 48 --all-views",
+                f"hyperplanes render --checkpoint {PACKAGED_MODEL} --views scene "
+                "--out new-views --orbit 48 --all-views",
             ),
             (
                 "the same after 100 steps on those images, which makes it sharper",
-                f"hyperplanes render --checkpoint {PACKAGED} --views scene --out sharper --steps 100 --all-views",
+                f"hyperplanes render --checkpoint {PACKAGED_MODEL} --views scene --out sharper --steps 100 --all-views",
             ),
         ],
     )
@@ -120,9 +121,9 @@ def _round(model: HyperPlanes, support: Views, cameras: PinholeCamera) -> Pixels
 def compile_kernels(device: torch.device) -> None:
     """Compile and load everything that rendering with the packaged model needs, by one small view of an example."""
     example = read_task(EXAMPLES / "example-car")
-    model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED)).to(device)
+    model = HyperPlanes.from_pretrained(packaged_folder(PACKAGED_MODEL)).to(device)
     model.config = replace(model.config, symmetric=False)  # the search for symmetry takes time and compiles nothing
-    few = example.support[:FEWEST].resized(32)  # enough views for stacking
+    few = example.support[:MIN_VIEWS].resized(32)  # enough views for stacking
     model.adapt(few).render(resized(example.query[:1].cameras, 32, 32))
 
 

@@ -13,9 +13,9 @@ from hyperplanes.rendering.renderer import RayMarching
 from hyperplanes.utilities.files.reading import folder_checksum
 from hyperplanes.utilities.messages.shell import command_line
 
-__all__ = ["MODELS", "PACKAGED", "TUNED", "DemoSettings", "describe_row"]
+__all__ = ["MODELS", "PACKAGED_MODEL", "TUNED_METHODS", "DemoSettings", "describe_row"]
 
-TUNED = ("hyperplanes", "scratch")
+TUNED_METHODS = ("hyperplanes", "scratch")
 """Methods in the chart of PSNR over fine-tuning steps."""
 
 MODELS = ("hyperplanes", "point_multiplane")
@@ -24,9 +24,9 @@ MODELS = ("hyperplanes", "point_multiplane")
 BASELINES = ("nearest_view", "hull_blend")
 """Methods without learned weights, in the tables of both pages."""
 
-PACKAGED = "small"
+PACKAGED_MODEL = "small"
 QUERY_VIEWS = 2  # of each object on the page of the packaged model
-MOST = 12  # objects on that page
+MAX_OBJECTS = 12  # objects on that page
 
 TINY = {
     "model.network.depth": 2,
@@ -122,7 +122,7 @@ class DemoSettings:
     @property
     def fine_tuning(self) -> Experiment:
         """The experiment on PSNR after several numbers of fine-tuning steps."""
-        rows = [row for method in TUNED for row in at_steps(method, self.tuning)]
+        rows = [row for method in TUNED_METHODS for row in at_steps(method, self.tuning)]
         return self._experiment([self._cell(row, row) for row in rows], objects=self.tuned_objects)
 
     @property
@@ -134,10 +134,10 @@ class DemoSettings:
         for row, count in rows.items():
             method = row if row in BASELINES else "hyperplanes"
             for on in (*self.first, *(["meshes"] if self.meshes else [])):
-                trained = Trained(on, packaged=PACKAGED)
+                trained = Trained(on, packaged=PACKAGED_MODEL)
                 orbit = self.first_frames if row == f"views_{self.first_counts[-1]}" else 0
                 cells.append(Cell(row, on, trained, method, on, "all", views=count, query=QUERY_VIEWS, orbit=orbit))
-        return self._experiment(cells, objects=MOST - len(self.first), keep_pictures=True)
+        return self._experiment(cells, objects=MAX_OBJECTS - len(self.first), keep_pictures=True)
 
     def _cell(self, row: str, method: str, on: str = "") -> Cell:
         # either training has the architecture for random weights; PointMultiPlaneNeRF ends first

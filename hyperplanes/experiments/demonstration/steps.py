@@ -10,7 +10,7 @@ from pathlib import Path
 
 from hyperplanes.evaluation import Score
 from hyperplanes.experiments.demonstration.report import compile_kernels, describe_count, write_first_page, write_report
-from hyperplanes.experiments.demonstration.settings import MODELS, TUNED, DemoSettings
+from hyperplanes.experiments.demonstration.settings import MODELS, TUNED_METHODS, DemoSettings
 from hyperplanes.experiments.engine import OnScore, Runner
 from hyperplanes.experiments.paper.experiment import Cell
 from hyperplanes.experiments.paper.scales import Scale
@@ -104,7 +104,7 @@ class Demonstration:
             found[cell.row] = self.runner.score(self.settings.fine_tuning, cell, self.settings.seed).mean("psnr")
             self.say(f"{cell.row}: {found[cell.row]:.2f} dB")
         steps = self.settings.tuning
-        write_json(path, {m: {str(n): found[row] for n in steps for row in at_steps(m, [n])} for m in TUNED})
+        write_json(path, {m: {str(n): found[row] for n in steps for row in at_steps(m, [n])} for m in TUNED_METHODS})
 
     def report(self) -> None:
         """Write the page, its picture and metrics.json."""

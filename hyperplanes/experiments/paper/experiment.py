@@ -52,8 +52,8 @@ class Cell:
         trainable: what fine-tuning optimises. The paper optimises the hypernetwork while theta is frozen.
         views: the number of support views; None for as many as the model has planes.
         query: the number of query views, if the support views are those of the other views that are farthest apart
-            (`data.support.Shown`). With None, the support views are the first ones of the data set, and all query views
-            are evaluated.
+            (`data.support.FarthestSupport`). With None, the support views are the first ones of the data set, and
+            all query views are evaluated.
         orbit: the number of views on a circle around each object that are written to files, if the experiment keeps
             pictures.
     """

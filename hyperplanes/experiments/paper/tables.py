@@ -9,15 +9,15 @@ from hyperplanes.experiments.paper.published import CROSS, SHAPENET, SINGLE, TAR
 from hyperplanes.utilities.entry_points import load_entries
 from hyperplanes.utilities.messages.errors import did_you_mean
 
-__all__ = ["CLASSES", "EXPERIMENTS", "find_experiment", "find_experiments"]
+__all__ = ["CLASS_OF_COLUMN", "EXPERIMENTS", "find_experiment", "find_experiments"]
 
-CLASSES = {"Cars": "car", "Chairs": "chair", "Planes": "plane", "Lamps": "lamp"}
+CLASS_OF_COLUMN = {"Cars": "car", "Chairs": "chair", "Planes": "plane", "Lamps": "lamp"}
 """The names of the classes of `generate` by the paper's headings."""
 
 EPOCHS_128 = {"car": 1000, "lamp": 1100, "chair": 700}
 EPOCHS_200 = {"car": 2420, "plane": 2460, "chair": 1920}
 
-LEARNED = {
+LEARNED_COLUMNS = {
     "Standard": ("standard", "mv_meta"),
     "MV Matched": ("mv_matched", "mv_matched"),
     "MV Shuffled": ("mv_shuffled", "mv_meta"),
@@ -25,11 +25,15 @@ LEARNED = {
     "SV Meta": ("sv_meta", "sv_meta"),
 }
 """Methods of Tancik et al., each with the training that it needs. "standard" only needs its architecture."""
-SHOWN = (1, 3, 5, 25)
+SUPPORT_COUNTS = (1, 3, 5, 25)
 """Numbers of support views in the table of learned initialisations; the paper does not state how many these had."""
-TARGETS = {"NeRF": "nerf", "MultiPlaneNeRF": "multiplane", "PointMultiPlaneNeRF": "point_multiplane"}
-TUNED = {"HyperPlanes-0": "hyperplanes", "HyperPlanes-10": "hyperplanes_10", "HyperPlanes-100": "hyperplanes_100"}
-WHOLE = "HyperPlanes-100, all weights"
+TARGET_COLUMNS = {"NeRF": "nerf", "MultiPlaneNeRF": "multiplane", "PointMultiPlaneNeRF": "point_multiplane"}
+TUNED_COLUMNS = {
+    "HyperPlanes-0": "hyperplanes",
+    "HyperPlanes-10": "hyperplanes_10",
+    "HyperPlanes-100": "hyperplanes_100",
+}
+ALL_WEIGHTS = "HyperPlanes-100, all weights"
 """100 steps on theta + delta as in `render --steps 100`, with fewer rays at the scale `small`; not in the paper."""
 
 
@@ -42,15 +46,15 @@ def _hyperplanes(on: str, changes: Mapping[str, object] | None = None, planes: i
 
 
 def _tuned(row: str, trained: Trained, on: str, split: Split = "test") -> list[Cell]:
-    cells = [Cell(row, column, trained, method, on, split) for column, method in TUNED.items()]
-    return [*cells, Cell(row, WHOLE, trained, "hyperplanes_100", on, split, trainable="weights")]
+    cells = [Cell(row, column, trained, method, on, split) for column, method in TUNED_COLUMNS.items()]
+    return [*cells, Cell(row, ALL_WEIGHTS, trained, "hyperplanes_100", on, split, trainable="weights")]
 
 
 def _shapenet() -> Experiment:
-    columns = {name: CLASSES[name] for name in SHAPENET.columns}
+    columns = {name: CLASS_OF_COLUMN[name] for name in SHAPENET.columns}
     cells: list[Cell] = []
-    for views in SHOWN:
-        for name, (method, training) in LEARNED.items():
+    for views in SUPPORT_COUNTS:
+        for name, (method, training) in LEARNED_COLUMNS.items():
             for column, on in columns.items():
                 reference = Trained(on, "mv_meta") if training == "mv_matched" else None
                 trained = Trained(on, training, reference=reference)
@@ -59,7 +63,9 @@ def _shapenet() -> Experiment:
             for column, on in columns.items():
                 trained = Trained(on, packaged=packaged)
                 cells.append(Cell(_with_views(name, views), column, trained, "hyperplanes", on, views=views))
-    published = {_with_views(name, 1): name for name in LEARNED} | {_with_views("HyperPlanes", 25): "HyperPlanes"}
+    published = {_with_views(name, 1): name for name in LEARNED_COLUMNS} | {
+        _with_views("HyperPlanes", 25): "HyperPlanes"
+    }
     return Experiment(
         "shapenet",
         "Hypernetwork against gradient-based updates",
@@ -90,13 +96,13 @@ def _cross_class() -> Experiment:
     names = ("Cars", "Chairs", "Planes")
     cells: list[Cell] = []
     for source in names:
-        on = _hyperplanes(CLASSES[source], ALL_READ)
+        on = _hyperplanes(CLASS_OF_COLUMN[source], ALL_READ)
         for target in names:
             row = f"{source} on {target}"
             for column in ("MultiPlaneNeRF", "PointMultiPlaneNeRF"):  # the latter is the field of HyperPlanes alone
-                plain = Trained(CLASSES[source], TARGETS[column])
-                cells.append(Cell(row, column, plain, TARGETS[column], CLASSES[target]))
-            cells += _tuned(row, on, CLASSES[target])
+                plain = Trained(CLASS_OF_COLUMN[source], TARGET_COLUMNS[column])
+                cells.append(Cell(row, column, plain, TARGET_COLUMNS[column], CLASS_OF_COLUMN[target]))
+            cells += _tuned(row, on, CLASS_OF_COLUMN[target])
     return Experiment(
         "cross-class",
         "Trained on one class, tested on each",
@@ -112,7 +118,7 @@ def _cross_class() -> Experiment:
             "tab:single_inference.",
             "PointMultiPlaneNeRF: the field of HyperPlanes as one set of weights for all objects, not in the paper. "
             "MultiPlaneNeRF and HyperPlanes differ in the field and in the hypernetwork; this column separates both.",
-            f"{WHOLE}: not in the paper.",
+            f"{ALL_WEIGHTS}: not in the paper.",
         ),
     )
 
@@ -121,7 +127,7 @@ def _target() -> Experiment:
     cells = [
         Cell(row, column, _hyperplanes("car", {"model.target": target}), "hyperplanes", "car", quantity=quantity)
         for row, quantity in (("PSNR", "psnr"), ("SSIM", "ssim"))
-        for column, target in TARGETS.items()
+        for column, target in TARGET_COLUMNS.items()
     ]
     return Experiment(
         "target",
@@ -140,7 +146,7 @@ def _target() -> Experiment:
 def _time() -> Experiment:
     cells = [
         Cell("seconds", column, _hyperplanes("car", ALL_READ), method, "car", quantity="image_seconds")
-        for column, method in TUNED.items()
+        for column, method in TUNED_COLUMNS.items()
     ]
     return Experiment(
         "time",
@@ -165,7 +171,7 @@ def _single_class() -> Experiment:
     parts: dict[str, Split] = {"Train": "train", "Test": "test"}
     for part, split in parts.items():
         for name in ("Cars", "Chairs", "Planes"):
-            row, on = f"{part} {name}", CLASSES[name]
+            row, on = f"{part} {name}", CLASS_OF_COLUMN[name]
             cells.append(Cell(row, "MultiPlaneNeRF", Trained(on, "multiplane"), "multiplane", on, split))
             cells.append(Cell(row, "Autoencoder", Trained(on, "autoencoder"), "autoencoder", on, split))
             cells += _tuned(row, _hyperplanes(on, ALL_READ), on, split)
@@ -181,7 +187,7 @@ def _single_class() -> Experiment:
         SINGLE,
         (
             "On training objects the paper prints one number for 0, 10 and 100 steps; here they are fine-tuned.",
-            f"{WHOLE}: not in the paper.",
+            f"{ALL_WEIGHTS}: not in the paper.",
             "pictures.png shows what fig:reconstruction, fig:reconstruction_big and fig:fine_tuning do.",
         ),
         pictures=("Test Cars", "Test Chairs", "Test Planes"),
@@ -191,10 +197,10 @@ def _single_class() -> Experiment:
 def _iterations() -> Experiment:
     cells: list[Cell] = []
     for name in ("Cars", "Chairs"):
-        on = _hyperplanes(CLASSES[name])
-        cells.append(Cell(f"{name}: HyperPlanes", "0", on, "hyperplanes", CLASSES[name]))
+        on = _hyperplanes(CLASS_OF_COLUMN[name])
+        cells.append(Cell(f"{name}: HyperPlanes", "0", on, "hyperplanes", CLASS_OF_COLUMN[name]))
         for steps in (100, 300, 1000, 3000, 10_000, 36_000):
-            cells.append(Cell(f"{name}: NeRF", str(steps), on, f"nerf_scratch_{steps}", CLASSES[name]))
+            cells.append(Cell(f"{name}: NeRF", str(steps), on, f"nerf_scratch_{steps}", CLASS_OF_COLUMN[name]))
     return Experiment(
         "iterations",
         "One forward pass of HyperPlanes against iterations of NeRF on the same object",

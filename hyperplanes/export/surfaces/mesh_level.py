@@ -23,7 +23,7 @@ __all__ = ["Agreement", "agreement", "choose_level"]
 
 SILHOUETTE = 64  # pixels along the longer side of the compared silhouettes
 LEVEL_VIEWS = 8
-LEVELS = 60
+LEVEL_CANDIDATES = 60
 DEPTH_TOLERANCE = 0.05  # radii of the scene
 
 
@@ -52,8 +52,11 @@ def choose_level(field: AdaptedField, density: Float[Tensor, "x y z"], cameras: 
         raise ValueError("field: expected some density, got one that is empty everywhere; train longer, or check masks")
     small = _small_cameras(cameras, LEVEL_VIEWS)
     covered, depth = _rendered(field, small)
-    bounds, levels = field.occupancy.bounds, torch.from_numpy(np.geomspace(top * 1e-4, top * 0.9, LEVELS)).float()
-    right, union = torch.zeros(LEVELS), torch.zeros(LEVELS)
+    bounds, levels = (
+        field.occupancy.bounds,
+        torch.from_numpy(np.geomspace(top * 1e-4, top * 0.9, LEVEL_CANDIDATES)).float(),
+    )
+    right, union = torch.zeros(LEVEL_CANDIDATES), torch.zeros(LEVEL_CANDIDATES)
     for view, first in enumerate(_first_crossings(density, levels, bounds, small)):
         seen, wanted = first.isfinite(), covered[view, :, None]
         near = (first - depth[view, :, None]).abs() <= DEPTH_TOLERANCE * bounds.radius

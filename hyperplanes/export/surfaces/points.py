@@ -19,11 +19,11 @@ from hyperplanes.utilities.files.reading import format_of
 from hyperplanes.utilities.files.writing import write_whole
 from hyperplanes.utilities.messages.arguments import checked
 
-__all__ = ["POINTS", "PointCloud", "point_cloud", "save_points"]
+__all__ = ["POINT_COUNT", "PointCloud", "point_cloud", "save_points"]
 
-POINTS = 100_000
-OPAQUE = 0.9  # opacity from which on a pixel gives a point
-TOLERANCE = 0.02  # largest difference of depths of one place between views, in radii of the scene
+POINT_COUNT = 100_000
+MIN_POINT_OPACITY = 0.9  # opacity from which on a pixel gives a point
+DEPTH_TOLERANCE = 0.02  # largest difference of depths of one place between views, in radii of the scene
 HALVINGS = 24  # bisection steps for the side of the cells in which points are averaged
 FINEST = 1e-4  # smallest cell, in radii of the scene
 
@@ -48,7 +48,7 @@ class PointCloud:
 
 @checked
 @torch.no_grad()
-def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, count: int = POINTS) -> PointCloud:
+def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, count: int = POINT_COUNT) -> PointCloud:
     """The points of all opaque pixels, averaged in cells, without those that other views contradict.
 
     A view contradicts a point that lies in front of the surface it shows there. A point is kept if more views show a
@@ -69,7 +69,7 @@ def point_cloud(pictures: Pictures, cameras: PinholeCamera, bounds: Sphere, coun
     if count < 1:
         raise ValueError(f"count: expected at least 1 point, got {count}")
     surface = seen_surface(pictures, cameras)
-    opaque = (surface.covered > 0) & (pictures.opacity[:, 0] >= OPAQUE)
+    opaque = (surface.covered > 0) & (pictures.opacity[:, 0] >= MIN_POINT_OPACITY)
     if not opaque.any():
         raise ValueError("pictures: expected opaque pixels, got none; train longer")
     points, normals = surface.points[opaque], surface.normals[opaque]
@@ -115,8 +115,8 @@ def _is_confirmed(points: Tensor, z: Tensor, cameras: PinholeCamera, bounds: Sph
         inside = ((pixel >= 0) & (pixel < pixel.new_tensor([width, height]))).all(-1) & (depth > 0)
         column, row = torch.where(inside[:, None], pixel, 0.0).long().unbind(-1)
         shown = torch.where(z[view] > 0, z[view], torch.inf)[row, column]
-        votes += inside & ((shown - depth).abs() <= TOLERANCE * bounds.radius)
-        votes -= (inside & (shown - depth > TOLERANCE * bounds.radius)).long()
+        votes += inside & ((shown - depth).abs() <= DEPTH_TOLERANCE * bounds.radius)
+        votes -= (inside & (shown - depth > DEPTH_TOLERANCE * bounds.radius)).long()
     return votes > 0
 
 

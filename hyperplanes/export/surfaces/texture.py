@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 __all__ = ["TexturedSurface", "save_textured", "texture_surface"]
 
 FACES = 10_000
-SIZE = 1024
-TOLERANCE = 1.5  # largest distance between a texel and the surface that a view sees, in pixels
+TEXTURE_SIZE = 1024
+DEPTH_TOLERANCE_PIXELS = 1.5  # largest distance between a texel and the surface that a view sees, in pixels
 OBLIQUE = 0.2  # smallest cosine by which the tolerance is divided
-SHARPNESS = 4  # exponent of the cosine between normal and view in the weights of views
+COSINE_EXPONENT = 4  # exponent of the cosine between normal and view in the weights of views
 OF_FIELD = 0.02  # weight of the field's own colour, beside 1 of a view along the normal
-CHUNK = 1 << 15
+TEXEL_CHUNK = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class TexturedSurface:
 
 @torch.no_grad()
 def texture_surface(
-    surface: Surface, field: AdaptedField, views: Views, *, faces: int = FACES, size: int = SIZE
+    surface: Surface, field: AdaptedField, views: Views, *, faces: int = FACES, size: int = TEXTURE_SIZE
 ) -> TexturedSurface:
     """The surface with a texture instead of vertex colours.
 
@@ -89,7 +89,7 @@ def texture_surface(
     outward = normalize(torch.from_numpy((mesh.normals[corners] * shares[..., None]).sum(1)), dim=-1)
     # weighted mean of the colours of field and views
     device = field.occupancy.occupied.device
-    parts = zip(points.to(device).split(CHUNK), (-outward).to(device).split(CHUNK), strict=True)
+    parts = zip(points.to(device).split(TEXEL_CHUNK), (-outward).to(device).split(TEXEL_CHUNK), strict=True)
     total = OF_FIELD * torch.cat([field(here, along)[0].cpu() for here, along in parts])
     weight = torch.full((len(points), 1), OF_FIELD)
     for seen, share in _seen(solid, points, outward, views.to("cpu", torch.float32)):
@@ -174,11 +174,11 @@ def _seen(
         shown = (local > camera.least_depth(views.cameras)) & at.isfinite().all(-1)
         at = torch.where(shown[:, None], at, 2.0)[None, None]
         first, span = grid_sample(maps, at, mode="nearest", align_corners=True)[0, :, 0]
-        tolerance = TOLERANCE * pixel * distance / facing.clamp_min(OBLIQUE)
+        tolerance = DEPTH_TOLERANCE_PIXELS * pixel * distance / facing.clamp_min(OBLIQUE)
         visible = ((first - distance).abs() < tolerance) & (span < 3 * tolerance)  # and no depth edge beside it
         colour = grid_sample(views.images[view : view + 1], at, padding_mode="border", align_corners=True)[0, :, 0].T
         inner = 1 - fading(borders[[view]], at[0, 0, :, None].clamp(-1, 1), views.size)
-        yield colour, facing.clamp_min(0)[:, None] ** SHARPNESS * visible[:, None] * inner
+        yield colour, facing.clamp_min(0)[:, None] ** COSINE_EXPONENT * visible[:, None] * inner
 
 
 def _spread(

@@ -26,7 +26,7 @@ __all__ = ["FASTMATH", "compile_function", "compile_kernel", "layers_module"]
 
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}  # all but the flags that assume no NaN and no infinity
 
-ROOM = 2**21
+MACHINE_CODE_BYTES = 2**21
 """Approximate size of the machine code of all kernels, in bytes."""
 
 LLVM_OF_BFLOAT16 = (20, 0, 0)
@@ -215,7 +215,7 @@ def _cache_folder() -> str:
             part.mkdir(mode=0o700, exist_ok=True)
         if all(map(_is_private, (folder.parent, folder))):
             with tempfile.TemporaryFile(dir=folder) as file:
-                file.write(bytes(ROOM))
+                file.write(bytes(MACHINE_CODE_BYTES))
                 file.flush()
                 return str(folder)
         problem = "it is not this user's alone"

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import torch
 
-__all__ = ["at_once", "parallel_for", "parallel_map", "side_by_side"]
+__all__ = ["map_long_parts", "parallel_for", "parallel_map", "run_concurrently"]
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
@@ -24,7 +24,7 @@ Other = TypeVar("Other")
 _pools: dict[tuple[int, str], ThreadPoolExecutor] = {}
 _single: dict[int, ThreadPoolExecutor] = {}  # their threads run each PyTorch operation on one thread
 _making = Lock()
-_second = Lock()  # held while `at_once` runs two computations
+_second = Lock()  # held while `run_concurrently` runs two computations
 
 
 def parallel_for(work: Callable[[int, int], Result], total: int, chunk: int) -> list[Result]:
@@ -87,7 +87,7 @@ def parallel_map(work: Callable[[Part], Result], parts: Sequence[Part]) -> Itera
             future.cancel()
 
 
-def side_by_side(work: Callable[[Part], Result], parts: Sequence[Part], device: torch.device) -> list[Result]:
+def map_long_parts(work: Callable[[Part], Result], parts: Sequence[Part], device: torch.device) -> list[Result]:
     """The results of a few long parts, in order, by `parallel_map` where that keeps all threads busy.
 
     On other devices, and with more threads than parts, the parts run one after the other on all threads.
@@ -102,7 +102,9 @@ def side_by_side(work: Callable[[Part], Result], parts: Sequence[Part], device: 
 
 
 @torch.no_grad()
-def at_once(one: Callable[[], Result], other: Callable[[], Other], device: torch.device) -> tuple[Result, Other]:
+def run_concurrently(
+    one: Callable[[], Result], other: Callable[[], Other], device: torch.device
+) -> tuple[Result, Other]:
     """The results of two computations in several steps each, whose parts `parallel_map` runs; without gradients.
 
     While one of them waits for its last part, or runs what is not parallel, parts of the other run. On other devices,

@@ -17,11 +17,11 @@ __all__ = ["more_symmetric_plane", "most_symmetric_plane"]
 
 AZIMUTHS = 45  # azimuths of normals that are tried first
 OFFSETS = (-0.04, -0.02, 0.0, 0.02, 0.04)  # of planes from the middle of the voxels, in radii of the scene
-APART = math.radians(20)  # least angle between the azimuths of refined planes
+MIN_AZIMUTH_DIFFERENCE = math.radians(20)  # least angle between the azimuths of refined planes
 FOLLOWED = 2  # planes that are refined
-COARSE, FINE = 3000, 12000  # most points that are reflected
+COARSE_POINTS, FINE_POINTS = 3000, 12000  # most points that are reflected
 COARSE_ROUNDS, FINE_ROUNDS = 5, 9  # of the search for better planes around one
-SPAN = 0.01  # first steps around a given plane, in radians and radii
+INITIAL_STEP = 0.01  # first steps around a given plane, in radians and radii
 
 
 @torch.no_grad()
@@ -46,7 +46,7 @@ def most_symmetric_plane(voxels: Occupancy) -> Plane:
     fine = voxels.occupied.float()
     coarse = max_pool3d(fine[None], 2)[0]
     blocks = Occupancy(coarse > 0, voxels.bounds)
-    points, surface = _points_of(blocks, COARSE), _points_of(voxels.surface(), FINE)
+    points, surface = _points_of(blocks, COARSE_POINTS), _points_of(voxels.surface(), FINE_POINTS)
 
     # all azimuths, and the best ones that are not neighbours
     angles = torch.arange(AZIMUTHS) * (math.pi / AZIMUTHS)
@@ -56,7 +56,7 @@ def most_symmetric_plane(voxels: Occupancy) -> Plane:
     order = _overlap(coarse, points, planes, "nearest").argsort(descending=True).tolist()
     followed: list[Tensor] = []
     for plane in planes[order]:
-        if all(abs(float(plane[:3] @ each[:3])) < math.cos(APART) for each in followed):
+        if all(abs(float(plane[:3] @ each[:3])) < math.cos(MIN_AZIMUTH_DIFFERENCE) for each in followed):
             followed.append(plane)
         if len(followed) == FOLLOWED:
             break
@@ -84,8 +84,8 @@ def more_symmetric_plane(voxels: Occupancy, plane: Plane) -> Plane:
     normal = torch.tensor(plane.normal)
     through = float(normal @ torch.tensor(voxels.bounds.centre))
     start = torch.cat([normal, torch.tensor([(plane.offset - through) / voxels.bounds.radius])])
-    surface = _points_of(voxels.surface(), FINE)
-    span = (SPAN, SPAN, SPAN)
+    surface = _points_of(voxels.surface(), FINE_POINTS)
+    span = (INITIAL_STEP, INITIAL_STEP, INITIAL_STEP)
     return _in_world(_refined(voxels.occupied.float(), surface, start, span, FINE_ROUNDS, "bilinear"), voxels.bounds)
 
 

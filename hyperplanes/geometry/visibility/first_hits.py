@@ -21,9 +21,9 @@ from hyperplanes.utilities.tensors.transforms import are_plain
 
 __all__ = ["first_hits"]
 
-STEPS = 128  # samples along a diameter of the scene
-ROUND = 8  # samples tested at once, without compiled kernels
-ROWS = 16  # rows of pixels per kernel call
+STEPS_PER_DIAMETER = 128  # samples along a diameter of the scene
+SAMPLES_AT_ONCE = 8  # samples tested at once, without compiled kernels
+ROWS_PER_CALL = 16  # rows of pixels per kernel call
 RAYS_AT_ONCE = 1 << 17  # cast together, without compiled kernels: those of many photographs would take gigabytes
 
 
@@ -39,8 +39,9 @@ def first_hits(
         masks: (view, 1, height, width); pixels where they are 0 are skipped.
 
     Returns:
-        Distances along unit rays, exact to half a STEPS-th of the scene's diameter. A ray that hits nothing has the
-        distance at which it leaves the scene's sphere, a skipped pixel that of the sphere's centre plus its radius.
+        Distances along unit rays, exact to half a STEPS_PER_DIAMETER-th of the scene's diameter. A ray that hits
+        nothing has the distance at which it leaves the scene's sphere, a skipped pixel that of the sphere's centre plus
+        its radius.
     """
     height, width = camera.image_size(cameras)
     centres, bounds = camera.centres(cameras), occupancy.bounds
@@ -71,11 +72,11 @@ def _find_compiled(occupancy: Occupancy, cameras: PinholeCamera, masks: Tensor, 
         masks = masks * shown
     fixed = (
         *(each.to(result).contiguous().numpy() for each in (numbers, pixels)), masks.numpy(),
-        np.array([*bounds.centre, bounds.radius], np.float32), np.float32(2 * bounds.radius / STEPS),
+        np.array([*bounds.centre, bounds.radius], np.float32), np.float32(2 * bounds.radius / STEPS_PER_DIAMETER),
         np.array(occupancy.box, np.float32), occupancy.occupied.contiguous().numpy().view(np.uint8), result.numpy(),
     )  # fmt: skip
     kernel = compile_kernel("hull.first_hits.first_hits", torch.float32)
-    parallel_for(lambda a, b: kernel(*fixed, a, b), result.shape[0] * result.shape[1], ROWS)
+    parallel_for(lambda a, b: kernel(*fixed, a, b), result.shape[0] * result.shape[1], ROWS_PER_CALL)
 
 
 def _without_lenses(cameras: DistortedCamera, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -87,12 +88,12 @@ def _without_lenses(cameras: DistortedCamera, height: int, width: int) -> tuple[
 
 
 def _hits_torch(occupancy: Occupancy, rays: Rays) -> Float[Tensor, " ray"]:
-    """The distances, in plain PyTorch: ROUND samples at a time of all rays that have hit nothing yet."""
-    step, device = 2 * occupancy.bounds.radius / STEPS, rays.near.device
+    """The distances, in plain PyTorch: SAMPLES_AT_ONCE samples at a time of all rays that have hit nothing yet."""
+    step, device = 2 * occupancy.bounds.radius / STEPS_PER_DIAMETER, rays.near.device
     nearest, left = rays.far.clone(), torch.arange(len(rays), device=device)
-    for first in range(0, STEPS + 1, ROUND):
+    for first in range(0, STEPS_PER_DIAMETER + 1, SAMPLES_AT_ONCE):
         part = rays[left]
-        t = part.near[:, None] + (torch.arange(first, first + ROUND, device=device) + 0.5) * step
+        t = part.near[:, None] + (torch.arange(first, first + SAMPLES_AT_ONCE, device=device) + 0.5) * step
         inside = occupancy.contains(part.at(t)) & (t < part.far[:, None])
         hit = inside.any(1)
         nearest[left[hit]] = t[hit].gather(1, inside[hit].byte().argmax(1, keepdim=True))[:, 0]

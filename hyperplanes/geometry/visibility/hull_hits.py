@@ -17,8 +17,8 @@ from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 
 __all__ = ["centres_in_hull", "hull_hits"]
 
-RAYS, LAYERS = 512, 2  # rays, and layers of voxels, per kernel call
-POINTS = 1 << 14  # per call, without compiled kernels
+RAY_CHUNK, LAYERS = 512, 2  # rays, and layers of voxels, per kernel call
+HULL_POINT_CHUNK = 1 << 14  # per call, without compiled kernels
 
 
 @torch.no_grad()
@@ -53,7 +53,7 @@ def hull_hits(
     )  # fmt: skip
     nearest = torch.empty(len(rays))
     kernel = compile_kernel("hull.hull_hits.hull_hits", torch.float32)
-    parallel_for(lambda a, b: kernel(*fixed, nearest.numpy(), a, b), len(rays), RAYS)
+    parallel_for(lambda a, b: kernel(*fixed, nearest.numpy(), a, b), len(rays), RAY_CHUNK)
     return nearest
 
 
@@ -67,7 +67,7 @@ def centres_in_hull(planes: VisibilityPlanes, opacity: float) -> Occupancy:
     """
     voxels, occupied = planes.occupancy, planes.occupancy.occupied.clone()
     if not planes.has_kernels(planes.maps):
-        points = voxels.centres().to(planes.maps).split(POINTS)
+        points = voxels.centres().to(planes.maps).split(HULL_POINT_CHUNK)
         occupied[voxels.occupied] = torch.cat([planes.choose(each, best=0).coverage >= opacity for each in points])
         return replace(voxels, occupied=occupied)
     cameras, shape, bounds = planes.shown_cameras(), planes.maps.shape, voxels.bounds

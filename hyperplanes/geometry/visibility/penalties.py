@@ -10,24 +10,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hyperplanes.geometry.chosen_views import BEYOND, CUT, MARGIN, WHOLE, Penalties
+from hyperplanes.geometry.chosen_views import BORDER_MARGIN, BORDER_PENALTY, BORDER_POLE, OPAQUE_MASK, Penalties
 
-__all__ = ["Against", "fading", "margin", "margins"]
+__all__ = ["ViewPenalties", "fading", "margin", "margins"]
 
-CUTTING = 0.02  # of the shorter side: a border with that many object pixels along it crops the object
+MIN_CROPPED_SHARE = 0.02  # of the shorter side: a border with that many object pixels along it crops the object
 
 
 @dataclass(frozen=True)
-class Against:
+class ViewPenalties:
     """The penalties of the views of planes.
 
     Attributes:
-        handicaps: added to the penalty of each view wherever it shows a point.
+        offsets: added to the penalty of each view wherever it shows a point.
         margins: as `margins` returns them.
         penalties: costs of depth and of masks.
     """
 
-    handicaps: Float[Tensor, " view"]
+    offsets: Float[Tensor, " view"]
     margins: Float[Tensor, "view 4"]
     penalties: Penalties
 
@@ -53,11 +53,11 @@ class Against:
         """
         own = self.penalties
         penalty = (own.steep * behind).clamp(own.least, own.deepest)
-        penalty = (penalty + own.partly * (coverage < WHOLE)).clamp_max(own.highest) + self.handicaps
+        penalty = (penalty + own.partly * (coverage < OPAQUE_MASK)).clamp_max(own.highest) + self.offsets
         if not self._cut:
             return penalty
         cut = fading(self.margins, coordinates, size)
-        return torch.where(cut > 0, penalty.clamp_min(0) + CUT * cut / (BEYOND - cut), penalty)
+        return torch.where(cut > 0, penalty.clamp_min(0) + BORDER_PENALTY * cut / (BORDER_POLE - cut), penalty)
 
 
 def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 4"]:
@@ -65,15 +65,15 @@ def margins(masks: Float[Tensor, "view 1 height width"]) -> Float[Tensor, "view 
 
     Args:
         masks: opacity in [0, 1]. A border crops the object where several of its pixels are opaque; a single one may be
-            noise, and UNKNOWN ones, of reflections, do not count.
+            noise, and UNKNOWN_OPACITY, of reflections, do not count.
 
     Returns:
         Widths; 0 at borders that do not crop the object.
     """
     height, width = masks.shape[2:]
-    whole = masks[:, 0] >= WHOLE
+    whole = masks[:, 0] >= OPAQUE_MASK
     borders = whole[:, :, 0], whole[:, :, -1], whole[:, 0], whole[:, -1]
-    cut = torch.stack([each.sum(1) >= max(2, CUTTING * min(height, width)) for each in borders], 1)
+    cut = torch.stack([each.sum(1) >= max(2, MIN_CROPPED_SHARE * min(height, width)) for each in borders], 1)
     return margin(height, width) * cut
 
 
@@ -94,4 +94,4 @@ def fading(margins: Float[Tensor, "view 4"], coordinates: Float[Tensor, "point v
 
 def margin(height: int, width: int) -> float:
     """The width of a margin of a picture of this size, in pixels."""
-    return MARGIN * min(height, width)
+    return BORDER_MARGIN * min(height, width)

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.chosen_views import (
-    ANGLE,
-    BEYOND,
-    CUT,
-    FADING,
+    BORDER_PENALTY,
+    BORDER_POLE,
+    INVISIBLE_PENALTY,
+    OPAQUE_MASK,
+    PENALTY_RADIANS,
     SMALLEST_ANGLE,
-    UNSEEN,
-    WHOLE,
+    WEIGHT_FALLOFF,
     ChosenViews,
     Described,
     Penalties,
@@ -37,8 +37,8 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility.first_hits import first_hits
-from hyperplanes.geometry.visibility.penalties import Against, margin, margins
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.geometry.visibility.penalties import ViewPenalties, margin, margins
+from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.transforms import (
     are_plain,
     is_transformed,
@@ -49,17 +49,18 @@ from hyperplanes.utilities.tensors.transforms import (
 
 __all__ = ["VisibilityPlanes", "choose_torch"]
 
-POINTS = 512  # per kernel call
+VISIBILITY_CHUNK = 512  # per kernel call
 
 
 class VisibilityPlanes:
     """ImagePlanes with the masks and the depth of the visual hull beside the colours.
 
     A view's penalty at a point is how far the point lies behind the first surface that it sees, in radii of the scene
-    beyond the `tolerance` and at most DEEPEST; PARTLY more where its mask is not opaque, so that background is mixed
-    into the colour; and UNSEEN where the point is not in the picture. Where a border of a picture crops the object, the
-    penalty rises over a MARGIN towards it, so that the view has no weight left where the picture ends: otherwise seams
-    would show between pictures of different exposure (Buehler et al. 2001, "Unstructured Lumigraph Rendering").
+    beyond the `tolerance` and at most MAX_DEPTH_PENALTY; PARTIAL_MASK_PENALTY more where its mask is not opaque, so
+    that background is mixed into the colour; and INVISIBLE_PENALTY where the point is not in the picture. Where a
+    border of a picture crops the object, the penalty rises over a BORDER_MARGIN towards it, so that the view has no
+    weight left where the picture ends: otherwise seams would show between pictures of different exposure
+    (Buehler et al. 2001, "Unstructured Lumigraph Rendering").
 
     Args:
         images: (view, 3, height, width), RGB in [0, 1].
@@ -81,7 +82,7 @@ class VisibilityPlanes:
             torch.ones_like(images[:, 0]) if masks is None else masks[:, 0].to(images), cameras, occupancy
         )
         self._surface: Float[Tensor, "view height width 2"] | None = None
-        self._against = Against(
+        self._view_penalties = ViewPenalties(
             images.new_zeros(len(images)),
             images.new_zeros(len(images), 4) if masks is None else margins(masks).to(images),
             Penalties(),
@@ -123,18 +124,18 @@ class VisibilityPlanes:
         """
         return self._with(penalties=penalties)
 
-    def with_handicaps(self, handicaps: Float[Tensor, " view"]) -> VisibilityPlanes:
-        """The same planes with handicaps of the views.
+    def with_penalty_offsets(self, offsets: Float[Tensor, " view"]) -> VisibilityPlanes:
+        """The same planes with penalty offsets of the views.
 
         Args:
-            handicaps: added to the penalty of each view wherever it shows a point.
+            offsets: added to the penalty of each view wherever it shows a point.
         """
-        return self._with(handicaps=handicaps.to(self._against.handicaps))
+        return self._with(offsets=offsets.to(self._view_penalties.offsets))
 
     def _with(self, **changes: Any) -> VisibilityPlanes:
         """The same planes with other view penalties."""
         result = copy.copy(self)
-        result._against = replace(self._against, **changes)
+        result._view_penalties = replace(self._view_penalties, **changes)
         return result
 
     def with_surface(self, voxels: Occupancy) -> VisibilityPlanes:
@@ -164,8 +165,8 @@ class VisibilityPlanes:
             points: in the world.
             directions: unit vectors along which the points are seen; without them there are no nearest views.
             best: number of views of least penalty, at most all; 0 where only the nearest are wanted.
-            nearest: number of views with the least sum of their angle to the direction, in radians, and ANGLE times
-                their penalty where it is positive. One more is returned where there is one.
+            nearest: number of views with the least sum of their angle to the direction, in radians, and
+                PENALTY_RADIANS times their penalty where it is positive. One more is returned where there is one.
 
         Returns:
             The views, chosen from all of them; their colours are not looked up.
@@ -190,16 +191,33 @@ class VisibilityPlanes:
 
     def _limits(self) -> list[float]:
         """The parameters of the kernels."""
-        per_radius, own = 1 / self.occupancy.bounds.radius, self._against.penalties
-        limits = [self.colours.nearest, per_radius, self.tolerance, own.deepest, own.partly, WHOLE, UNSEEN, ANGLE]
-        return [*limits, own.steep, own.highest, own.least, 1 / margin(*self.maps.shape[1:3]), CUT, BEYOND]
+        per_radius, own = 1 / self.occupancy.bounds.radius, self._view_penalties.penalties
+        limits = [
+            self.colours.nearest,
+            per_radius,
+            self.tolerance,
+            own.deepest,
+            own.partly,
+            OPAQUE_MASK,
+            INVISIBLE_PENALTY,
+            PENALTY_RADIANS,
+        ]
+        return [
+            *limits,
+            own.steep,
+            own.highest,
+            own.least,
+            1 / margin(*self.maps.shape[1:3]),
+            BORDER_PENALTY,
+            BORDER_POLE,
+        ]
 
     def shown_cameras(self) -> Tensor:
-        """What the kernels read of each view: centre, projection matrix, 0 where masked, handicap and margins."""
-        against, masked, cameras = self._against, self.colours.masked, self.colours.cameras
-        poses = kept(self, "poses", [cameras.extrinsics, cameras.intrinsics], self._poses)
+        """What the kernels read of each view: centre, projection matrix, 0 where masked, penalty offset and margins."""
+        penalties, masked, cameras = self._view_penalties, self.colours.masked, self.colours.cameras
+        poses = cached_on(self, "poses", [cameras.extrinsics, cameras.intrinsics], self._poses)
         shown = poses.new_ones(len(self)) if masked is None else (~masked).to(poses)
-        return torch.cat([poses, torch.stack([shown, against.handicaps]), against.margins.T])
+        return torch.cat([poses, torch.stack([shown, penalties.offsets]), penalties.margins.T])
 
     def _poses(self) -> Float[Tensor, "number view"]:
         """Centres and projection matrices."""
@@ -221,7 +239,7 @@ class VisibilityPlanes:
         numbers = np.array(self._limits(), np.float32)
         outputs = [each.flatten().numpy() for each in (views[0], values[0], views[1], values[1], overall)]
         kernel = compile_kernel("visibility.choosing.choose", torch.float32)
-        parallel_for(lambda a, b: kernel(*fixed, shape, numbers, *outputs, a, b), count, POINTS)
+        parallel_for(lambda a, b: kernel(*fixed, shape, numbers, *outputs, a, b), count, VISIBILITY_CHUNK)
         chosen = [ChosenViews(each, *_split(value)) for each, value in zip(views, values, strict=True)]
         return Visibility(chosen[0], None if directions is None else chosen[1], *overall.unbind(1))
 
@@ -272,7 +290,7 @@ class VisibilityPlanes:
         weights, colours = torch.empty(len(along), kept), torch.empty(len(along), kept, 3)
         surface = points.new_zeros(0) if self._surface is None else self._surface
         depths = self.depth_opacity if reading.best or self._surface is None else self.maps
-        numbers = [*self._limits(), FADING, reading.falloff, SMALLEST_ANGLE]
+        numbers = [*self._limits(), WEIGHT_FALLOFF, reading.falloff, SMALLEST_ANGLE]
         frequencies = reading.point_frequencies, reading.direction_frequencies
         maps = [each.contiguous().flatten().numpy() for each in (self.shown_cameras(), depths, surface)]
         fixed = (
@@ -283,7 +301,7 @@ class VisibilityPlanes:
             *(each.numpy() for each in (rows, coverage, near, weights, colours)),
         )  # fmt: skip
         kernel = compile_kernel("visibility.describing.describe", torch.float32)
-        parallel_for(lambda a, b: kernel(*fixed, a, b), count, POINTS)
+        parallel_for(lambda a, b: kernel(*fixed, a, b), count, VISIBILITY_CHUNK)
         return Described(rows, coverage, near, weights, colours)
 
 
@@ -311,8 +329,10 @@ def choose_torch(
     coverage = torch.where(valid, coverage, 1.0)
     # depth behind the surface, in radii, and the penalty of each view
     behind = torch.where(valid, (distances - depth) / planes.occupancy.bounds.radius, 0.0)
-    penalty = planes._against.penalty(behind - planes.tolerance, coverage, found.coordinates, depth_opacity.shape[1:3])
-    penalty = torch.where(valid, penalty, UNSEEN)
+    penalty = planes._view_penalties.penalty(
+        behind - planes.tolerance, coverage, found.coordinates, depth_opacity.shape[1:3]
+    )
+    penalty = torch.where(valid, penalty, INVISIBLE_PENALTY)
 
     def chosen(score: Tensor, count: int) -> ChosenViews:
         if not count:
@@ -324,7 +344,7 @@ def choose_torch(
     near = None
     if directions is not None:
         angle = torch.acos((rays * directions[:, None]).sum(-1).clamp(-1, 1))
-        near = chosen(angle + ANGLE * penalty.clamp_min(0), nearest)
+        near = chosen(angle + PENALTY_RADIANS * penalty.clamp_min(0), nearest)
     return Visibility(chosen(penalty, best), near, coverage.amin(1), valid.sum(1).to(points))
 
 

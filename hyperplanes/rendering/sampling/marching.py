@@ -23,8 +23,9 @@ from hyperplanes.utilities.tensors.transforms import are_plain
 __all__ = ["RayMarching", "march"]
 
 CANDIDATES = 1 << 21  # samples tested against the grid at once; 12 bytes each
-RAYS = 512  # in one call of the kernel
-PIXELS, MOST_PIXELS = 100, 4.0  # across the scene for 5/3 of the samples of training; largest ratio to that number
+RAY_CHUNK = 512  # in one call of the kernel
+REFERENCE_PIXELS = 100  # across the scene, for 5/3 of the samples of training
+MAX_PIXEL_RATIO = 4.0  # largest ratio to that number
 MOST_STEPS = 1 << 14
 STOP_FACTOR, HIGHEST_STOP = 4.0, 0.1  # of `stop` for pictures, in which stopped rays are opaque
 
@@ -62,7 +63,7 @@ class RayMarching:
         Args:
             pixels: along the diameter of the scene's sphere.
         """
-        finer = math.sqrt(min(max(pixels / PIXELS, 1 / MOST_PIXELS), MOST_PIXELS))
+        finer = math.sqrt(min(max(pixels / REFERENCE_PIXELS, 1 / MAX_PIXEL_RATIO), MAX_PIXEL_RATIO))
         stop = max(self.stop, min(HIGHEST_STOP, STOP_FACTOR * self.stop))
         return RayMarching(min(MOST_STEPS, round(self.steps * finer * 5 / 3)), stop)
 
@@ -155,7 +156,7 @@ def _walk_compiled(
         kernel(origins, directions, first, far, number(step), *arrays, begin, end)
         return torch.from_numpy(ray[: found[0]].copy()), torch.from_numpy(distances[: found[0]].copy())
 
-    parts = parallel_for(part, len(rays), max(1, min(RAYS, CANDIDATES // count)))
+    parts = parallel_for(part, len(rays), max(1, min(RAY_CHUNK, CANDIDATES // count)))
     if not parts:
         return start.new_zeros(0, dtype=torch.long), start.new_zeros(0)
     ray, distances = (torch.cat(each) for each in zip(*parts, strict=True))

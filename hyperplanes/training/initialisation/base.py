@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.adaptation.fine_tuning import fine_tune_to, made_anyway
+from hyperplanes.adaptation.fine_tuning import fine_tune_to, ignoring_no_progress
 from hyperplanes.configuration.initialisation import InitialisationConfig
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.parameters import Parameters
@@ -36,7 +36,9 @@ class InitialisationObjective(Objective):
     def adapt(self, prepared: SupportContext) -> AdaptedField:
         """The field of a held-out object after as many gradient steps as in training, even if they make no progress."""
         settings = replace(self.initialisation.descent(self.config.rays), seed=self.config.seed)
-        return made_anyway(lambda: fine_tune_to(self.model, prepared, self.initialisation.inner_steps, settings))
+        return ignoring_no_progress(
+            lambda: fine_tune_to(self.model, prepared, self.initialisation.inner_steps, settings)
+        )
 
     def set_gradients(self, gradient: Parameters) -> None:
         """Set the gradients for the optimisers, since no backward pass does so."""

@@ -18,7 +18,7 @@ from torch import distributed
 
 __all__ = ["count_processes", "launched"]
 
-PATIENCE = timedelta(hours=6)
+DISTRIBUTED_TIMEOUT = timedelta(hours=6)
 """How long a process waits for another one, for example while the first one validates."""
 
 GRACE = 5.0
@@ -93,7 +93,7 @@ def launched(devices: int, nodes: int, device: torch.device) -> Generator[torch.
     from lightning_fabric.strategies import DDPStrategy
 
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
-    strategy = DDPStrategy(timeout=PATIENCE)
+    strategy = DDPStrategy(timeout=DISTRIBUTED_TIMEOUT)
     fabric = Fabric(accelerator=device.type, devices=devices, num_nodes=nodes, strategy=strategy)
     try:
         fabric.launch()

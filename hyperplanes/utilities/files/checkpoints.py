@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 CHECKSUM = "sha256"  # entry of the file's own metadata
-LARGEST = 64 * 2**30  # bytes
+MAX_CHECKPOINT_BYTES = 64 * 2**30  # bytes
 
 
 class CheckpointError(files.DataError):
@@ -80,7 +80,7 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
         raise CheckpointError(
             f"{path}: expected weights, found no file; check the path; `hyperplanes train` writes those of models"
         )
-    files.check_regular(path, LARGEST)
+    files.check_regular(path, MAX_CHECKPOINT_BYTES)
     try:
         with safe_open(path, "pt") as file:
             checksum = (file.metadata() or {}).get(CHECKSUM)

@@ -10,7 +10,7 @@ from hyperplanes.utilities.tensors.transforms import are_plain
 
 __all__ = ["check_image_range"]
 
-MOST = 1.5
+MAX_PIXEL_VALUE = 1.5
 """Largest pixel value accepted as an image in [0, 1]; rendered values may overshoot slightly."""
 
 
@@ -33,6 +33,6 @@ def check_image_range(name: str, values: object) -> None:
     if not values.numel() or values.is_meta or not are_plain(values):
         return
     low, high = (float(value) for value in values.detach().aminmax())
-    if not (1 - MOST <= low and high <= MOST):
+    if not (1 - MAX_PIXEL_VALUE <= low and high <= MAX_PIXEL_VALUE):
         found = f"{low:g} to {high:g}; divide 8-bit pixels by 255" if low == low else "NaN"
         raise ValueError(f"{name}: expected finite numbers in [0, 1], got {found}")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 __all__ = ["available_memory", "require_memory"]
 
-SMALL = 2**30
+UNCHECKED_BYTES = 2**30
 """Bytes below which nothing is checked."""
 
 
@@ -41,7 +41,7 @@ def require_memory(what: str, found: object, needed: float, remedy: str) -> None
     Raises:
         ValueError: it does not fit.
     """
-    if needed <= SMALL or (free := available_memory()) is None or needed <= free:
+    if needed <= UNCHECKED_BYTES or (free := available_memory()) is None or needed <= free:
         return
     raise ValueError(
         f"{what}: expected a size that fits into the {free / 1e9:.1f} GB of free memory, got {found}, which needs "

@@ -20,7 +20,7 @@ from PIL import Image
 from data_gen import rigs
 from data_gen.meshes.mesh import mesh_parts, prepare_scene
 from data_gen.rendering.lighting import Lighting
-from data_gen.rendering.mesh_renderer import CHANNELS, MeshRenderer, RenderError
+from data_gen.rendering.mesh_renderer import RENDER_CHANNELS, MeshRenderer, RenderError
 from data_gen.rendering.renderers import RENDERERS, RendererError, probe
 from data_gen.rendering.surfaces import shaded_surfaces
 from data_gen.shapes import ONE_SIDED, make
@@ -307,7 +307,7 @@ def test_geometry_is_on_the_mesh_to_a_hundredth_of_a_pixel():
     mesh = placed(trimesh.creation.icosphere(2, radius=0.6), pose)
     mesh.metadata["smooth"] = False
     rig = replace(rigs.fixed(3, 40), width=50)
-    out = MeshRenderer("embree", supersample=1).render([mesh], rig, channels=CHANNELS)
+    out = MeshRenderer("embree", supersample=1).render([mesh], rig, channels=RENDER_CHANNELS)
     x, y = np.meshgrid(np.arange(50), np.arange(40))
     rays = np.stack((x, y, np.ones_like(x)), axis=-1) @ np.linalg.inv(rig.intrinsics[0]).T
     for view, world_from_camera in enumerate(rig.world_from_camera):

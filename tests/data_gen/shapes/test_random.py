@@ -11,12 +11,12 @@ from data_gen.shapes.materials import plain
 from data_gen.shapes.parts import Finish, Part, build_scene
 from data_gen.shapes.primitives import box
 from data_gen.shapes.profiles import ellipse, rectangle
-from data_gen.shapes.random.cuts import CUT, difference
-from data_gen.shapes.random.outlines import AROUND, outline
+from data_gen.shapes.random.cuts import CUT_FACE, difference
+from data_gen.shapes.random.outlines import OUTLINE_CORNERS, outline
 from data_gen.shapes.random.painting.marks import glyph
 from data_gen.shapes.random.painting.photographs import PHOTOGRAPHS
 from data_gen.shapes.random.painting.textures import TEXTURES
-from data_gen.shapes.random.primitives import FRAMES, PRIMITIVES, primitive
+from data_gen.shapes.random.primitives import BAR_PRIMITIVES, PRIMITIVES, primitive
 from data_gen.shapes.random.relief import displaced, vertex_normals
 from data_gen.shapes.random.structures import STRUCTURES
 from data_gen.shapes.random.tubes import frames_along, subdivided, tube
@@ -49,7 +49,7 @@ def test_compositions_are_watertight_and_names_of_parts_are_unique():
 @pytest.mark.parametrize("make", PRIMITIVES, ids=lambda make: make.__name__)
 def test_every_primitive_is_closed_oriented_outwards_and_fits_the_cube(make):
     for seed in range(4):
-        for fine in (False, True) if make not in FRAMES else (False,):
+        for fine in (False, True) if make not in BAR_PRIMITIVES else (False,):
             solid = make(np.random.default_rng(seed), fine)
             check_solid(solid, (seed, fine))
             assert np.abs(solid.vertices).max() < 2.0
@@ -70,7 +70,7 @@ def test_a_cut_keeps_the_texture_of_old_faces_and_names_new_ones():
     left = difference(cube, tool)
     check_solid(left, "cut")
     assert left.volume == pytest.approx(6)
-    new = left.cells[:, 0] == CUT
+    new = left.cells[:, 0] == CUT_FACE
     corners = left.vertices[left.faces]
     flat = (np.abs(corners[..., :2]) < 1e-12).all(axis=1).any(axis=1)
     np.testing.assert_array_equal(new, flat)
@@ -137,7 +137,7 @@ def test_glyphs_are_connected():
 
 def test_tubes_have_the_volumes_of_prisms_pyramids_and_rings():
     """Closed forms: base times height, a third of it, and Pappus' theorem for a ring of many corners."""
-    square = subdivided(rectangle(2.0, 2.0), AROUND)
+    square = subdivided(rectangle(2.0, 2.0), OUTLINE_CORNERS)
     assert tube(upright(3.0, 5), np.tile(square, (5, 1, 1))).volume == pytest.approx(12)
     shrinking = np.linspace(1, 0, 5)[:, None, None] * square
     assert tube(upright(3.0, 5), shrinking).volume == pytest.approx(4)
@@ -184,7 +184,7 @@ def test_outlines_do_not_intersect_themselves_and_fill_their_square():
     """Brute force: from the mean of the corners, the angle always increases to the next corner."""
     for seed in range(80):
         corners, _ = outline(np.random.default_rng(seed))
-        assert corners.shape == (AROUND, 2)
+        assert corners.shape == (OUTLINE_CORNERS, 2)
         assert np.abs(corners).max() == pytest.approx(1)
         around = corners - corners.mean(axis=0)
         following = np.roll(around, -1, axis=0)

@@ -48,7 +48,7 @@ def _line(rng: np.random.Generator, cells: int) -> np.ndarray:
 
 def writing(rng: np.random.Generator) -> Material:
     """Lines of glyphs on a plain ground."""
-    size, lines = patterns.SIZE, int(rng.integers(1, 7))
+    size, lines = patterns.TEXTURE_SIZE, int(rng.integers(1, 7))
     scale = max(1, size // (10 * lines))
     page = np.zeros((size, size), dtype=bool)
     for number in range(lines):
@@ -62,7 +62,7 @@ def writing(rng: np.random.Generator) -> Material:
 def label(rng: np.random.Generator) -> Material:
     """A rectangle with a word in it, on a ground with a stripe or two."""
     image = writing(rng).image.copy()
-    size = patterns.SIZE
+    size = patterns.TEXTURE_SIZE
     ground, ink = _two_colours(rng)
     top, left = (int(rng.uniform(0.08, 0.4) * size) for _ in range(2))
     bottom, right = (int(size - rng.uniform(0.08, 0.4) * size) for _ in range(2))
@@ -76,7 +76,7 @@ def label(rng: np.random.Generator) -> Material:
 
 def sign(rng: np.random.Generator) -> Material:
     """One large shape on a plain ground: a disc, a ring, a cross, a triangle, an arrow or a glyph."""
-    v, u = (np.mgrid[0 : patterns.SIZE, 0 : patterns.SIZE] + 0.5) / patterns.SIZE * 2 - 1
+    v, u = (np.mgrid[0 : patterns.TEXTURE_SIZE, 0 : patterns.TEXTURE_SIZE] + 0.5) / patterns.TEXTURE_SIZE * 2 - 1
     kind, size = int(rng.integers(6)), rng.uniform(0.4, 0.85)
     if kind == 0:
         shape = np.hypot(u, v) < size

@@ -57,7 +57,7 @@ def photograph(rng: np.random.Generator) -> Material:
     piece = np.rot90(pixels[top : top + side, left : left + side], int(rng.integers(4)))
     if rng.random() < 0.5:
         piece = piece[:, ::-1]
-    size = (patterns.SIZE, patterns.SIZE)
+    size = (patterns.TEXTURE_SIZE, patterns.TEXTURE_SIZE)
     image = np.asarray(Image.fromarray(np.ascontiguousarray(piece)).resize(size, Image.Resampling.BOX))
     grey = bool((pixels[..., 0] == pixels[..., 1]).all())
     if rng.random() < (0.8 if grey else 0.25):

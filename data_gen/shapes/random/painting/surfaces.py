@@ -9,7 +9,7 @@ import numpy as np
 from data_gen.shapes.choices import one_of
 from data_gen.shapes.materials import Material
 from data_gen.shapes.parts import Finish, Part
-from data_gen.shapes.random.cuts import CUT
+from data_gen.shapes.random.cuts import CUT_FACE
 from data_gen.shapes.random.painting.textures import random_material
 from data_gen.shapes.solids import Solid
 
@@ -43,7 +43,7 @@ class Paint:
         part = replace(Part.of(name, solid, self.draw()), finish=one_of(self._rng, self.finishes))
         if self._rng.random() < 0.25 and (solid.cells[:, 0] == -1).any():
             part = part.capped(self.draw(), *one_of(self._rng, ((True, False), (False, True), (True, True))))
-        cut = solid.cells[:, 0] == CUT
+        cut = solid.cells[:, 0] == CUT_FACE
         if cut.any() and self._rng.random() < 0.6:
             part = part.painted(cut, self.draw())
         return part

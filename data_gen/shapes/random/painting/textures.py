@@ -18,14 +18,12 @@ from data_gen.shapes.random.painting.photographs import photograph
 
 __all__ = ["TEXTURES", "octaves", "random_material"]
 
-SIZE = patterns.SIZE
-
 
 def octaves(rng: np.random.Generator, coarsest: int, count: int) -> np.ndarray:
-    """Noise (SIZE, SIZE) of several octaves, each of half the cells and half the strength, stretched to [0, 1]."""
-    total, strength = np.zeros((SIZE, SIZE)), 1.0
+    """Noise of several octaves, each of half the cells and half the strength, stretched to [0, 1]."""
+    total, strength = np.zeros((patterns.TEXTURE_SIZE, patterns.TEXTURE_SIZE)), 1.0
     for octave in range(count):
-        cells = min(coarsest << octave, SIZE // 2)
+        cells = min(coarsest << octave, patterns.TEXTURE_SIZE // 2)
         total += strength * patterns.noise(rng, (cells, cells))
         strength *= 0.55
     total -= total.min()
@@ -42,7 +40,7 @@ def _ramp(rng: np.random.Generator, level: np.ndarray, count: int) -> np.ndarray
 
 def _place(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates (u, v), each (size, size), turned by a random angle and in half of all cases bent by noise."""
-    row, column = (np.mgrid[0:SIZE, 0:SIZE] + 0.5) / SIZE
+    row, column = (np.mgrid[0 : patterns.TEXTURE_SIZE, 0 : patterns.TEXTURE_SIZE] + 0.5) / patterns.TEXTURE_SIZE
     angle = rng.choice([0.0, np.pi / 4, rng.uniform(0, np.pi)])
     u = np.cos(angle) * column + np.sin(angle) * row
     v = np.cos(angle) * row - np.sin(angle) * column

@@ -28,7 +28,7 @@ __all__ = ["ANNOTATIONS", "catalogue", "is_sequence", "read_sequence"]
 
 ANNOTATIONS = "frame_annotations.jgz"
 SET_LISTS = "set_lists/set_lists_fewview_dev.json"
-LARGEST = 2**30
+MAX_ANNOTATION_BYTES = 2**30
 """Largest size of the annotations in bytes, decompressed."""
 
 _FLIP = np.diag([-1.0, -1.0, 1.0])  # x left, y up, z forward to x right, y down, z forward
@@ -112,9 +112,9 @@ def _annotations(path: Path) -> dict[str, list[dict[str, Any]]]:
     check_regular(path)
     try:
         with gzip.open(path, "rb") as file:
-            text = file.read(LARGEST + 1)
-        if len(text) > LARGEST:
-            raise DataError(path, f"at most {LARGEST} bytes, unpacked", "more", "give a smaller category")
+            text = file.read(MAX_ANNOTATION_BYTES + 1)
+        if len(text) > MAX_ANNOTATION_BYTES:
+            raise DataError(path, f"at most {MAX_ANNOTATION_BYTES} bytes, unpacked", "more", "give a smaller category")
         listed = json.loads(text)
         sequences: dict[str, list[dict[str, Any]]] = defaultdict(list)
         for frame in listed:

@@ -31,7 +31,7 @@ __all__ = ["is_omniobject", "is_rendered", "objaverse", "omniobject", "read_omni
 
 FOCAL = 35 / 32  # in image widths
 CUBE = Sphere((0.0, 0.0, 0.0), math.sqrt(3) / 2)  # around the unit cube
-HELD_OUT = 3  # test objects in a category of OmniObject3D
+TEST_OBJECTS = 3  # test objects in a category of OmniObject3D
 VALID = "valid_paths.json"
 _LARGEST_ARRAY = 4096
 _REMEDY = "download the object again"
@@ -132,8 +132,8 @@ def omniobject(folder: Path) -> Catalogue | None:
         return None
     splits: dict[str, tuple[str, ...]] = {"train": (), "val": (), "test": ()}
     for found in paths.values():
-        splits["test"] += tuple(found)[:HELD_OUT]
-        splits["train"] += tuple(found)[HELD_OUT:]
+        splits["test"] += tuple(found)[:TEST_OBJECTS]
+        splits["train"] += tuple(found)[TEST_OBJECTS:]
     where = {name: path for found in paths.values() for name, path in found.items()}
     classes = {name: {"class": category} for category, found in paths.items() for name in found}
 

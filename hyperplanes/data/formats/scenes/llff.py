@@ -20,7 +20,7 @@ from hyperplanes.utilities.files.reading import DataError, list_files
 __all__ = ["FILE", "is_llff", "read_llff"]
 
 FILE = "poses_bounds.npy"
-LARGEST_FILE = 64 * 2**20
+MAX_POSES_BYTES = 64 * 2**20
 
 
 def is_llff(folder: Path) -> bool:
@@ -73,7 +73,7 @@ def read_llff(folder: Path, root: Path) -> Listing:
 
 def _rows(source: Path, root: Path) -> npt.NDArray[np.float64]:
     """The (view, 17) array of the file."""
-    rows = read_array(source, "an array of numbers", LARGEST_FILE, root)
+    rows = read_array(source, "an array of numbers", MAX_POSES_BYTES, root)
     if (
         not isinstance(rows, np.ndarray)
         or rows.ndim != 2

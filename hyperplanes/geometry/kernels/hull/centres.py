@@ -9,7 +9,7 @@ import numpy as np
 from hyperplanes.geometry.kernels.hull.carving import LANES, fill_lanes
 from hyperplanes.geometry.kernels.llvm import load, read, store
 from hyperplanes.geometry.kernels.lookup.blocks import inlined
-from hyperplanes.geometry.lookup_torch import BORDER
+from hyperplanes.geometry.lookup_torch import BORDER_TOLERANCE
 
 __all__ = ["centres"]
 
@@ -21,7 +21,11 @@ def _judge(inside, cameras, view, maps, shape, x, y, bottom, voxel, min_z, opaci
     number = inside.dtype.type
     zero, half, one = number(0), number(0.5), number(1)
     height, width, pitch = np.int32(shape[1]), np.int32(shape[2]), shape[3]
-    low, right, lowest = number(-BORDER), number(width - 1 + BORDER), number(height - 1 + BORDER)
+    low, right, lowest = (
+        number(-BORDER_TOLERANCE),
+        number(width - 1 + BORDER_TOLERANCE),
+        number(height - 1 + BORDER_TOLERANCE),
+    )
     last_column, last_row = number(width - 1), number(height - 1)
     left_most, top_most = number(max(width - 2, 0)), number(max(height - 2, 0))
     next_column, next_row = np.int32(2 * min(width - 1, 1)), np.int32(2 * width * min(height - 1, 1))

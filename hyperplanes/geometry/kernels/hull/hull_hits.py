@@ -8,7 +8,7 @@ import numpy as np
 
 from hyperplanes.geometry.kernels.lookup.blocks import inlined
 from hyperplanes.geometry.kernels.voxels.boxes import samples_within
-from hyperplanes.geometry.lookup_torch import BORDER
+from hyperplanes.geometry.lookup_torch import BORDER_TOLERANCE
 
 __all__ = ["hull_hits"]
 
@@ -29,7 +29,11 @@ def _opacity(cameras, pitch, view, x, y, z, maps, shape, min_z):
     if not (camera_z > min_z and cameras[15 * pitch + view] > zero):
         return one
     u, v = u / camera_z, v / camera_z
-    low, right, bottom = number(-BORDER), number(width - 1 + BORDER), number(height - 1 + BORDER)
+    low, right, bottom = (
+        number(-BORDER_TOLERANCE),
+        number(width - 1 + BORDER_TOLERANCE),
+        number(height - 1 + BORDER_TOLERANCE),
+    )
     if not (u >= low and u <= right and v >= low and v <= bottom):
         return one
     u, v = min(max(u, zero), number(width - 1)), min(max(v, zero), number(height - 1))

@@ -22,12 +22,12 @@ from hyperplanes.geometry.kernels.layers.single import copy_block
 from hyperplanes.geometry.kernels.layers.vectors import LANES, address_of, read_vector, rounded, rounding, write_vector
 from hyperplanes.geometry.kernels.lookup.blocks import inlined
 
-__all__ = ["COLUMNS", "WIDEST", "layers", "multiply_layers", "pack_weights"]
+__all__ = ["COLUMNS", "MAX_LAYER_WIDTH", "layers", "multiply_layers", "pack_weights"]
 
 ROWS = LANES  # of a tile, each a vector of as many numbers in single precision
 TILE = COLUMNS = 2 * ROWS  # points and columns of four tiles, and inputs of one product
 BLOCK = 5 * TILE  # points that go through all layers together
-WIDEST = 2048  # no wider layers were measured
+MAX_LAYER_WIDTH = 2048  # no wider layers were measured
 
 _BYTE, _LONG = ir.IntType(8), ir.IntType(64)
 

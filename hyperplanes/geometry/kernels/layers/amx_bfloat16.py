@@ -8,9 +8,9 @@ from jaxtyping import Float, Int16
 from torch import Tensor
 
 from hyperplanes.geometry.kernels.layers import amx
-from hyperplanes.geometry.kernels.layers.amx import COLUMNS, WIDEST, multiply_layers
+from hyperplanes.geometry.kernels.layers.amx import COLUMNS, MAX_LAYER_WIDTH, multiply_layers
 
-__all__ = ["COLUMNS", "WIDEST", "layers", "pack_weights"]
+__all__ = ["COLUMNS", "MAX_LAYER_WIDTH", "layers", "pack_weights"]
 
 
 def pack_weights(weight: Float[Tensor, "output input"], first: int) -> Int16[Tensor, " number"]:

@@ -17,9 +17,9 @@ from torch.nn.functional import pad
 from hyperplanes.geometry.kernels.layers.single import BLOCK, COLUMNS, TILE, copy_block, multiply_tile
 from hyperplanes.geometry.kernels.layers.vectors import LANES, rounding
 
-__all__ = ["COLUMNS", "WIDEST", "layers", "pack_weights"]
+__all__ = ["COLUMNS", "MAX_LAYER_WIDTH", "layers", "pack_weights"]
 
-WIDEST = 512  # no wider layers were measured
+MAX_LAYER_WIDTH = 512  # no wider layers were measured
 
 _round = rounding(None)
 

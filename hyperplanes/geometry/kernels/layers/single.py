@@ -19,12 +19,12 @@ from torch import Tensor
 from hyperplanes.geometry.kernels.layers.vectors import LANES, BFloat, rounded
 from hyperplanes.geometry.kernels.lookup.blocks import inlined
 
-__all__ = ["BLOCK", "COLUMNS", "TILE", "WIDEST", "copy_block", "layers", "multiply_tile", "pack_weights"]
+__all__ = ["BLOCK", "COLUMNS", "MAX_LAYER_WIDTH", "TILE", "copy_block", "layers", "multiply_tile", "pack_weights"]
 
 TILE, VECTORS = 6, 4  # 24 of the 32 registers of AVX-512 hold sums, four weights
 COLUMNS = LANES * VECTORS
 BLOCK = 10 * TILE
-WIDEST = 512  # PyTorch is as fast for wider layers
+MAX_LAYER_WIDTH = 512  # PyTorch is as fast for wider layers
 
 _FUSED = {"flags": ("contract",)}
 

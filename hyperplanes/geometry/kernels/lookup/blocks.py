@@ -15,7 +15,7 @@ from numba import njit
 from hyperplanes.geometry.kernels.compiling import FASTMATH
 from hyperplanes.geometry.kernels.llvm import load, read, store
 from hyperplanes.geometry.kernels.memory import BLOCK
-from hyperplanes.geometry.lookup_torch import BORDER
+from hyperplanes.geometry.lookup_torch import BORDER_TOLERANCE
 
 __all__ = [
     "BLOCK",
@@ -89,7 +89,7 @@ def _clamped(value, last):
 @no_type_check
 def place(s, out, column, row, height, width):
     """RAW_U, RAW_V, RECIPROCAL -> clamped U, V; INSIDE; coordinates, into `out` at `column` and `row`."""
-    one, zero, border = s.dtype.type(1), s.dtype.type(0), s.dtype.type(BORDER)
+    one, zero, border = s.dtype.type(1), s.dtype.type(0), s.dtype.type(BORDER_TOLERANCE)
     right, bottom = s.dtype.type(width - 1), s.dtype.type(height - 1)
     per_column = s.dtype.type(2) / s.dtype.type(max(width - 1, 1))
     per_row = s.dtype.type(2) / s.dtype.type(max(height - 1, 1))

@@ -14,12 +14,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from hyperplanes.geometry.lookup_torch import BORDER, MIN_Z
+from hyperplanes.geometry.lookup_torch import BORDER_TOLERANCE, MIN_Z
 
 __all__ = ["lookup", "lookup_backward"]
 
 _BLOCK = 128
-_BORDER = tl.constexpr(BORDER)
+_BORDER = tl.constexpr(BORDER_TOLERANCE)
 
 
 @triton.jit

@@ -12,7 +12,7 @@ import numpy as np
 
 from hyperplanes.geometry.kernels.llvm import load, load_int, read, store, store_int
 from hyperplanes.geometry.kernels.lookup.blocks import inlined
-from hyperplanes.geometry.lookup_torch import BORDER
+from hyperplanes.geometry.lookup_torch import BORDER_TOLERANCE
 
 __all__ = ["choose", "judge", "least", "place", "rank"]
 
@@ -30,7 +30,11 @@ def place(s, pitch, total, x, y, z, cameras, shape, min_z):
     number = s.dtype.type
     zero, one = number(0), number(1)
     height, width = np.int32(shape[1]), np.int32(shape[2])
-    low, right, bottom = number(-BORDER), number(width - 1 + BORDER), number(height - 1 + BORDER)
+    low, right, bottom = (
+        number(-BORDER_TOLERANCE),
+        number(width - 1 + BORDER_TOLERANCE),
+        number(height - 1 + BORDER_TOLERANCE),
+    )
     last_column, last_row = number(width - 1), number(height - 1)
     most_column, most_row = number(max(width - 2, 0)), number(max(height - 2, 0))
     for k in range(total):
@@ -172,13 +176,13 @@ def choose(
     """Writes the chosen views of points start..stop. All arrays are flat.
 
     `cameras` holds 21 rows, a value a view and `pitch` apart: the three coordinates of its centre, the 3 x 4 projection
-    matrix, 0 where it is masked, its handicap, and the pixels of its margins. `maps` (view, row, column, 2) hold depth
-    and opacity. `shape` is the number of views, height, width, the numbers of chosen views, and the pitch; `limits`
-    min_z, 1 / radius, the tolerance, deepest and partly of `chosen_views.Penalties`, WHOLE, UNSEEN, ANGLE, steep,
-    highest, least, 1 / the pixels of a margin, CUT and BEYOND. `best` and `near` (point, chosen) get indices of views,
-    their values (point, chosen, 6) direction, depth behind the hull, opacity and penalty of each, and `overall`
-    (point, 2) the least opacity and the number of the views that show the point. Where there are no directions nothing
-    is written to `near`.
+    matrix, 0 where it is masked, its penalty offset, and the pixels of its margins. `maps` (view, row, column, 2) hold
+    depth and opacity. `shape` is the number of views, height, width, the numbers of chosen views, and the pitch;
+    `limits` min_z, 1 / radius, the tolerance, deepest and partly of `chosen_views.Penalties`, OPAQUE_MASK,
+    INVISIBLE_PENALTY, PENALTY_RADIANS, steep, highest, least, 1 / the pixels of a margin, BORDER_PENALTY and
+    BORDER_POLE. `best` and `near` (point, chosen) get indices of views, their values (point, chosen, 6) direction,
+    depth behind the hull, opacity and penalty of each, and `overall` (point, 2) the least opacity and the number of the
+    views that show the point. Where there are no directions nothing is written to `near`.
     """
     number = limits.dtype.type
     total, best_count, near_count, pitch = shape[0], shape[3], shape[4], shape[5]

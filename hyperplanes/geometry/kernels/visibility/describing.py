@@ -219,8 +219,8 @@ def describe(
 
     `shape` is the number of views, height, width, the numbers of best and nearest views in a row, the pitch of
     `cameras`, the bits of a packed channel, and the frequencies of points and directions; `numbers` are the limits of
-    `choosing.choose`, then FADING, FALLOFF and SMALLEST_ANGLE; `sphere` the centre and 1 / radius of the scene. The
-    others are as in `choosing.choose`.
+    `choosing.choose`, then WEIGHT_FALLOFF, FALLOFF and SMALLEST_ANGLE; `sphere` the centre and 1 / radius of the scene.
+    The others are as in `choosing.choose`.
     """
     number = numbers.dtype.type
     zero, one = number(0), number(1)

@@ -19,7 +19,7 @@ __all__ = ["add_gradients", "render", "shade"]
 
 MAX_SAMPLES = 1024  # samples of positive density on a ray whose gradient is computed
 HARMONICS = 9
-NUMBERS = 1 + 3 * HARMONICS  # per voxel; loops of constant length are unrolled and vectorised
+VALUES_PER_VOXEL = 1 + 3 * HARMONICS  # per voxel; loops of constant length are unrolled and vectorised
 
 
 @inlined
@@ -103,7 +103,7 @@ def _next_sample(index, values, empty, origin, along, first, last, step, per_cel
                 continue
             weight *= values[row, 0]
             density += weight
-            for number in range(NUMBERS):
+            for number in range(VALUES_PER_VOXEL):
                 mixed[number] += weight * values[row, number]
         if density > zero:
             return sample, x, y, z, density
@@ -229,8 +229,8 @@ def add_gradients(  # noqa: PLR0913
     A pixel is the mean of the rays `pixels[i]` to `pixels[i + 1]`.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
-    mixed = np.empty(NUMBERS, np.float32)
-    by_number = np.zeros(NUMBERS, np.float32)  # gradient by a sample's interpolated numbers, but density
+    mixed = np.empty(VALUES_PER_VOXEL, np.float32)
+    by_number = np.zeros(VALUES_PER_VOXEL, np.float32)  # gradient by a sample's interpolated numbers, but density
     most = 1  # rays of a pixel
     for pixel in range(start, stop):
         most = max(most, pixels[pixel + 1] - pixels[pixel])
@@ -313,7 +313,7 @@ def add_gradients(  # noqa: PLR0913
                     if row < 0:
                         continue
                     own_share, own = at_corner * values[row, 0] / density, zero
-                    for number in range(NUMBERS):
+                    for number in range(VALUES_PER_VOXEL):
                         own += by_number[number] * values[row, number]
                         gradient[row, number] += own_share * by_number[number]
                     gradient[row, 0] += at_corner * (by_density + (own - mean) / density)

@@ -8,14 +8,14 @@ import torch
 
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere
-from hyperplanes.utilities.tensors.kept import kept
+from hyperplanes.utilities.tensors.cached_on import cached_on
 
 
 def test_a_value_is_computed_again_after_an_in_place_change_or_for_another_tensor():
     owner, made = SimpleNamespace(), []
 
     def asked(*tensors):
-        return kept(owner, "sum", tensors, lambda: made.append(0) or float(sum(each.sum() for each in tensors)))
+        return cached_on(owner, "sum", tensors, lambda: made.append(0) or float(sum(each.sum() for each in tensors)))
 
     one, other = torch.ones(3), torch.zeros(2)
     assert asked(one, other) == asked(one, other) == 3.0
@@ -28,7 +28,7 @@ def test_a_value_is_computed_again_after_an_in_place_change_or_for_another_tenso
 
 def test_the_tensors_of_a_cached_value_are_kept_alive():
     owner, value = SimpleNamespace(), torch.ones(1000)
-    kept(owner, "sum", [value], lambda: 0)
+    cached_on(owner, "sum", [value], lambda: 0)
     alive = weakref.ref(value)
     del value
     gc.collect()
@@ -39,7 +39,7 @@ def test_values_inside_function_transforms_are_not_cached():
     owner = SimpleNamespace()
 
     def squared(value):
-        return kept(owner, "square", [value], lambda: value.square().sum())
+        return cached_on(owner, "square", [value], lambda: value.square().sum())
 
     for point in (torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])):
         assert torch.equal(torch.func.grad(squared)(point), 2 * point)
