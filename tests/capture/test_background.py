@@ -48,7 +48,7 @@ def scene():
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
-    for name, value in (("LEVELS", ((SIDE, 16, 16, 60),)), ("RAYS", 192), ("BEFORE", 4), ("BEHIND", 24)):
+    for name, value in (("LEVELS", ((SIDE, 16, 16, 60),)), ("RAYS_PER_STEP", 192), ("BEFORE", 4), ("BEHIND", 24)):
         monkeypatch.setattr(background, name, value)
 
 

@@ -120,7 +120,7 @@ def test_inputs_are_numbered_by_the_numbers_in_their_names():
                 task, support=replace(task.support, names=halves[0]), query=replace(task.query, names=halves[1])
             )
 
-    task = Inputs(Counted(), (0, 1, 2)).task("test0")
+    task = SupportByPosition(Counted(), (0, 1, 2)).task("test0")
     assert task.support.names == ("test/r_0.png", "test/r_3.png", "test/r_6.png")
     assert task.query.names == tuple(f"test/r_{number}.png" for number in (7, 9, 10, 13, 16))
 

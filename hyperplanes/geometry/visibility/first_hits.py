@@ -39,9 +39,9 @@ def first_hits(
         masks: (view, 1, height, width); pixels where they are 0 are skipped.
 
     Returns:
-        Distances along unit rays, exact to half a STEPS_PER_DIAMETER-th of the scene's diameter. A ray that hits
-        nothing has the distance at which it leaves the scene's sphere, a skipped pixel that of the sphere's centre plus
-        its radius.
+        Distances along unit rays, exact to a STEPS_PER_DIAMETER-th of the scene's diameter; parts thinner than that can
+        be missed. A ray that hits nothing has the distance at which it leaves the scene's sphere, a skipped pixel that
+        of the sphere's centre plus its radius.
     """
     height, width = camera.image_size(cameras)
     centres, bounds = camera.centres(cameras), occupancy.bounds
