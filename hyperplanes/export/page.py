@@ -51,8 +51,9 @@ PAGE = """<!doctype html>
 <title>{title}</title>
 <style>
 html, body {{ margin: 0; height: 100%; background: #fff; font: 14px/1.4 system-ui, sans-serif; color: #555; }}
-body > .voxels {{ height: 100%; aspect-ratio: auto; }}
-body > p {{ position: fixed; left: 1em; bottom: 0; pointer-events: none; }}
+body {{ display: flex; flex-direction: column; }}
+body > .voxels {{ flex: 1; min-height: 0; aspect-ratio: auto; }}
+body > p {{ margin: .3em 1em; }}
 </style>
 </head>
 <body>
@@ -83,6 +84,7 @@ def page_of(
     """
     # the initial camera
     start = orbit_cameras(views, 1)
+    intrinsics, (height, width) = camera.intrinsics(start)[0], camera.image_size(start)
     scene = {
         "side": baked.side,
         "rows": len(baked.values),
@@ -91,7 +93,7 @@ def page_of(
         "steps": BakedScene.steps,
         "up": upward(views.cameras),
         "eye": camera.centres(start)[0].tolist(),
-        "focal": float(camera.intrinsics(start)[0, 0, 0]) / min(camera.image_size(start)),
+        "focal": (float(intrinsics[0, 0]) / width, float(intrinsics[1, 1]) / height),
     }
     still = f'<img alt="" src="data:image/webp;base64,{base64.b64encode(picture).decode()}">' if picture else ""
     viewer = resources.files("hyperplanes.export").joinpath("viewer.js").read_text("utf-8")

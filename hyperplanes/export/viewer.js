@@ -415,7 +415,7 @@ window.showVoxels ||= (() => {
         const width = fixed ? fixed.width : Math.max(1, Math.round(box.width * ratio));
         const height = fixed ? fixed.height : Math.max(1, Math.round(box.height * ratio));
         if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-        const focal = (scene.focal * Math.min(width, height));
+        const focal = Math.min(scene.focal[0] * width, scene.focal[1] * height);
         const { rows, eye } = fixed || orbit.pose();
         const lens = fixed ? fixed.lens : [focal, focal, (width - 1) / 2, (height - 1) / 2];
         const corner = scene.centre.map((value) => value - scene.radius);

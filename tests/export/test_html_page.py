@@ -85,6 +85,22 @@ def test_the_page_shows_the_same_picture_as_the_baked_scene(baked, views, tmp_pa
     assert float(psnr(shown, truth)) > 38
 
 
+@pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
+def test_a_wide_window_shows_the_whole_object_of_tall_pictures(baked, views, tmp_path):
+    tall = camera.pinhole(camera.symmetric_intrinsics(96, 48, 0.4), camera.camera_from_world(views.cameras), 96, 48)
+    page = save_page(page_of(baked, Views(torch.ones(6, 3, 96, 48), tall, bounds=SPHERE)), tmp_path / "page.html", "")
+    picture = tmp_path / "shot.png"
+    flags = [flag for flag in FLAGS if "window-size" not in flag]
+    place = [f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}", "--window-size=800,300"]
+    command = [str(chromium), *flags, *place, page.resolve().as_uri()]
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    drawn = (np.array(Image.open(picture).convert("RGB")).astype(int).min(-1) < 200)[:260]  # above the caption
+    rows, columns = (drawn.any(axis).nonzero()[0] for axis in (1, 0))
+    assert np.ptp(rows) > 100
+    assert 0 < rows.min() < rows.max() < len(drawn) - 1
+    assert 200 < columns.min() < columns.max() < 600
+
+
 STORY = """
 const boxes = [...document.querySelectorAll(".voxels")], told = [];
 const state = () => boxes.map((box) => box.dataset.shown === "voxels" ? "v" : "p").join("");
