@@ -238,6 +238,7 @@ def test_an_unknown_verb_is_answered_with_a_suggestion(capsys):
         ("render", "missing --checkpoint, --views, --out; see hyperplanes render --help"),
         ("render small", "expected an option, got small; see hyperplanes render --help"),
         ("render --checkpoint", "--checkpoint: expected a value, got none"),
+        ("render --out=", "--out: expected a value, got an empty one"),
         ("render --checkpoint a b", "--checkpoint: expected one value, got a b"),
         ("render --all-views yes", "--all-views: expected no value, got yes"),
         ("render --orbit 1.5", "--orbit: expected a whole number, got 1.5"),

@@ -47,7 +47,9 @@ class Arguments:
         frames: Frames that are taken from a video, 60 if not given.
     """
 
-    photographs: Annotated[tyro.conf.Positional[Path], Exists("a folder of photographs, or a video")]
+    photographs: Annotated[
+        tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOGRAPHS"), Exists("a folder of photographs, or a video")
+    ]
     out: Path
     mask: Annotated[str, tyro.conf.arg(metavar="{auto,given,colour,network,grabcut,none,COMMAND}")] = "auto"
     size: Annotated[int, range(64, 1 << 16)] = 1000

@@ -166,6 +166,8 @@ class _Option:
             raise ValueError(f"{self.name}: expected {'one value' if self.most else 'no value'}, got {shown}")
         if not values and self.most == 1:
             raise ValueError(f"{self.name}: expected a value, got none")
+        if "" in values:  # as of a shell variable that is not set; an empty path would be the current folder
+            raise ValueError(f"{self.name}: expected a value, got an empty one")
         kinds = list(_kinds(get_args(self.hint)[0] if self.most > 1 else self.hint))
         for value in values:
             if not any(_reads(value, kind) for kind in kinds):

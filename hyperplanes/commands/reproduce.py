@@ -61,7 +61,7 @@ class Arguments:
         device: auto, cpu or cuda.
     """
 
-    name: tyro.conf.Positional[str]
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
     scale: Literal["smoke", "small", "gpu", "paper"] = "small"
     out: Path = Path("runs/reproduce")
     data: tuple[str, ...] = ()

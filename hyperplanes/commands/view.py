@@ -62,7 +62,7 @@ class Arguments(ViewsArguments):
         port: The port of the page on this machine.
     """
 
-    views: Annotated[tyro.conf.Positional[Path], POSED_IMAGES]
+    views: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIEWS"), POSED_IMAGES]
     checkpoint: Path = Path("small")
     steps: Annotated[int, range(100_000)] = 0
     fit: Annotated[int, range(10_000)] = 100
@@ -90,11 +90,11 @@ def run(arguments: Arguments) -> int:
         "--fit": arguments.fit != Arguments.fit and not arguments.compare,
     }
     refuse_of_baked(source, given)
+    others = _others(arguments, device)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
     shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
     baked = isinstance(source, BakedScene)
-    others = _others(arguments, device)
     viewer = LiveViewer(shown, arguments.port, None if baked else wanted.put, list(others))
     if arguments.port not in (0, urlsplit(viewer.address).port):
         console.warn(f"--port: {arguments.port} is in use; the next free port is taken")
