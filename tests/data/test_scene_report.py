@@ -113,6 +113,21 @@ def test_a_wrong_mask_and_a_blurred_picture_are_named():
     assert picture.size[0] > 800
 
 
+def test_a_view_of_another_place_is_named_first_and_promises_nothing_good():
+    views = ball()
+    for each in (views.masks, views.images):
+        each[5] = each[5].roll((SIZE // 3, SIZE // 3), (1, 2))
+    views.masks[3, :, :, : SIZE * 9 // 16] = 0  # the mask of less than half of the object
+    views.images[3] = torch.nn.functional.avg_pool2d(views.images[3], 5, 1, 2)
+    report = describe_scene(views)
+    assert len({view.name: view.faults for view in report.views}["3.png"]) == 2
+    assert report.worst[0].name == "5.png"
+    assert [view.name for view in report.wrong] == ["5.png"]
+    assert report.expectation() == (
+        "poor pictures: the pose or the mask is wrong of 5.png; correct it, or leave the view out"
+    )
+
+
 @pytest.mark.parametrize("binary", [False, True])
 def test_reprojection_errors_of_colmap(tmp_path, binary):
     """Three points have errors of 1, 2 and 6 pixels; a.png shows the first two, b.png all three."""

@@ -24,6 +24,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.poses import fibonacci_sphere
 from hyperplanes.utilities.images.sizes import scaled_size
+from hyperplanes.utilities.messages.errors import listed
 from hyperplanes.views import Views
 
 __all__ = ["COVERAGE_ANGLE", "WORST", "SceneReport", "ViewReport", "angles_to", "describe_scene", "stand_upright"]
@@ -99,8 +100,17 @@ class SceneReport:
 
     @property
     def worst(self) -> list[ViewReport]:
-        """Some views, the worst first: those with most faults, then those whose masks fit least."""
-        return sorted(self.views, key=lambda view: (-len(view.faults), view.agreement or 0.0))[:WORST]
+        """Some views, the worst first: the wrong ones, those with most faults, then those whose masks fit least."""
+        wrong = self.wrong
+        return sorted(self.views, key=lambda view: (view not in wrong, -len(view.faults), view.agreement or 0.0))[
+            :WORST
+        ]
+
+    @property
+    def wrong(self) -> list[ViewReport]:
+        """The views whose masks fit the hull of all less than half as well as usual: their pose or mask is wrong."""
+        fits = [view.agreement for view in self.views if view.agreement is not None]
+        return [view for view in self.views if view.agreement is not None and view.agreement < median(fits) / 2]
 
     @property
     def is_sound(self) -> bool:
@@ -155,6 +165,9 @@ class SceneReport:
             )
         if self.contradicted:
             return "poor pictures: poses and images contradict each other; see the conventions above"
+        if wrong := self.wrong:
+            names = listed([view.name for view in wrong])
+            return f"poor pictures: the pose or the mask is wrong of {names}; correct it, or leave the view out"
         unseen = [side for side, share in (("above", self.above), ("below", self.below)) if share < 0.25]
         if self.covered < 0.25:
             text = "good pictures only from near where the views stand; other sides are guessed"
