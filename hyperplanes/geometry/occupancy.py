@@ -28,8 +28,8 @@ __all__ = ["MIN_MASK_OPACITY", "Occupancy", "ball_extent", "carve", "dilate", "f
 
 LARGEST_SIDE = 1024  # voxels an axis: 1 GiB
 MIN_MASK_OPACITY = 0.03
-"""Opacity below which a pixel of a mask counts as background when files are read. Edges of supersampled pictures have
-at least 1/16. Masks that were scaled down may have less, so `carve` takes any value above 0 for the object."""
+"""Opacity below which a pixel of a mask counts as background when files are read, unless it is next to a larger one.
+Masks that were scaled down may have less at edges, so `carve` takes any value above 0 for the object."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
+from PIL import Image, ImageFilter
 from PIL.TiffImagePlugin import TiffImageFile
 from torch import Tensor
 
@@ -55,6 +55,7 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 
 Pixels = npt.NDArray[np.uint8]
 
+MIN_HAZY_SHARE = 0.01  # of a picture: pixels that are faint and next to faint ones only, of a hazy background
 _OVERSHOOT = 1.5  # largest ratio of a floating-point value to white; masks resampled by Lanczos reach 1.49
 _REMEDY = "render, export or download it again"
 _ORIENTATION = 0x0112  # tag of EXIF: 1 is upright, 2 to 8 are the other rotations and reflections
@@ -175,7 +176,7 @@ def opacity_of(mask: Pixels, has_alpha: bool) -> UInt8[np.ndarray, "height width
     """The opacity that an image of a mask states: its alpha if some pixel is not opaque, otherwise its largest channel.
 
     So the mask may also be a photograph whose background is transparent. If the largest value is 1, 1 marks the object
-    and becomes 255. Otherwise values below MIN_MASK_OPACITY become 0 (`without_haze`).
+    and becomes 255. Otherwise haze becomes 0 (`without_haze`).
 
     Args:
         mask: (height, width, 4), as `read_image` returns it.
@@ -208,16 +209,23 @@ def read_mask(path: str | Path, size: tuple[int, int] | None = None) -> UInt8[np
 
 
 def without_haze(opacity: Pixels) -> Pixels:
-    """8-bit opacity with 0 in place of values below MIN_MASK_OPACITY.
+    """8-bit opacity of a picture; if its background is hazy, values below MIN_MASK_OPACITY become 0.
 
     A hull treats every value above 0 as a part of the object, and many programs that cut objects out leave 1 or 2 of
-    255 all over the background. The values are replaced where files are read, before images are scaled down: the mean
-    of an edge and its background may be smaller, and does belong to the object.
+    255 all over the background. Where only edges have such values, they belong to the object and do not change. They
+    are replaced where files are read, before images are scaled down: the mean of an edge and its background may be
+    smaller than MIN_MASK_OPACITY.
 
-    >>> without_haze(np.array([0, 2, 7, 8, 255], np.uint8)).tolist()
-    [0, 0, 0, 8, 255]
+    >>> without_haze(np.array([[1, 1, 1, 3, 200]], np.uint8)).tolist(), without_haze(np.array([[0, 3, 200]], np.uint8))
+    ([[0, 0, 0, 0, 200]], array([[  0,   3, 200]], dtype=uint8))
     """
-    return np.where(opacity < 255 * MIN_MASK_OPACITY, np.uint8(0), opacity)
+    least = 255 * MIN_MASK_OPACITY
+    faint = (opacity > 0) & (opacity < least)
+    if not faint.any():
+        return opacity
+    around = np.asarray(Image.fromarray(opacity).filter(ImageFilter.MaxFilter(3)))
+    is_hazy = (faint & (around < least)).mean() > MIN_HAZY_SHARE
+    return np.where(faint, np.uint8(0), opacity) if is_hazy else opacity
 
 
 def composite_over_white(
