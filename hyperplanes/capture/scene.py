@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,6 +98,9 @@ def write_scene(
     for name in former:
         if (folder / name).is_file():
             (folder / name).unlink()
+    if not any(name.startswith("masks/") for name in files):
+        with suppress(OSError):  # a folder that is absent, or holds other files
+            (folder / "masks").rmdir()
     for name, data in files.items():
         write_whole(folder / name, data, durable=False)
     write_whole(folder / POINT_CLOUD_FILE, encode_ply(model.points, model.colours), durable=False)

@@ -103,6 +103,12 @@ def test_masks_of_a_folder_are_found_by_name(scene, tmp_path):
         read_views(folder)
 
 
+def test_an_empty_folder_for_masks_counts_as_none(scene, tmp_path):
+    folder = scene.write(tmp_path, scene.document(), mode="RGB")
+    (tmp_path / "masks").mkdir()
+    assert read_views(folder).masks is None
+
+
 def test_frames_that_are_missing_are_left_out_and_named(scene, tmp_path):
     document = scene.document(train_filenames=scene.names[:5], test_filenames=scene.names[5:])
     folder = scene.write(tmp_path, document)
