@@ -215,6 +215,25 @@ def test_for_a_video_without_poses_the_error_says_how_to_get_them(given, tmp_pat
         read_views(tmp_path / given)
 
 
+@pytest.mark.parametrize("image", [None, "images/0.jpg"])
+def test_for_an_unfinished_capture_the_error_says_how_to_continue_it(image, tmp_path):
+    """Also if it was interrupted while it wrote the images."""
+    from hyperplanes.data import open_dataset
+
+    out = tmp_path / "scene"
+    (out / "capture" / "pictures").mkdir(parents=True)
+    (out / "capture" / "pictures.json").write_text('{"key": "1", "done": false}')
+    (out / ".lock").touch()
+    if image is not None:
+        (out / image).parent.mkdir()
+        Image.new("RGB", (8, 8)).save(out / image)
+    said = f"{out}: expected a scene, found an unfinished capture; continue it: hyperplanes capture PHOTOS --out {out}"
+    for action in (read_views, read_task, open_dataset):
+        with pytest.raises(DataError) as caught:
+            action(out)
+        assert str(caught.value) == said
+
+
 def test_heic_photographs_of_a_phone_are_counted(tmp_path):
     for index in range(3):
         (tmp_path / f"{index}.HEIC").touch()
