@@ -88,6 +88,8 @@ class _Work:
     sources: list[str] = field(default_factory=list)
     """The checksums of the photographs, or that of the video."""
     notes: list[str] = field(default_factory=list)
+    originals: dict[str, str] = field(default_factory=dict)
+    """The name of the photograph from which each file of the stage `pictures` was made; the progress names it."""
 
     @property
     def record(self) -> SceneRecord:
@@ -115,7 +117,13 @@ def capture(
     source, out, settings = Path(source), Path(out), settings or Settings()
     check_mask(settings.mask)
     _refuse_inside(out, source)
-    work = _Work(Stages(out / WORK), settings, progress or (lambda stage, done, total, text: None))
+    originals = dict[str, str]()
+
+    def named(stage: str, done: int, total: int, text: str) -> None:
+        if progress is not None:
+            progress(stage, done, total, originals.get(text, text))
+
+    work = _Work(Stages(out / WORK), settings, named, originals=originals)
     photographs, is_video = _photographs(source, work)
     if not is_video:
         _refuse_inside(out, *(path for one in photographs for path in (one.path, one.mask) if path is not None))
@@ -244,6 +252,7 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
         camera = cameras.setdefault((one.camera, size), len(cameras))
         focal = None if one.focal is None else one.focal * max(size)
         pictures.append(Picture(f"{index:05d}.jpg", camera, size, focal))
+        work.originals[pictures[-1].file] = one.path.name
     opacities = {row: folder / f"{index:05d}.mask.png" for row, index in enumerate(readable) if index in done["masked"]}
     return [photographs[index] for index in readable], pictures, opacities
 
