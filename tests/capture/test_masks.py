@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
 from hyperplanes.capture import Settings, pipeline
 from hyperplanes.capture.masks import consistency
@@ -153,6 +154,30 @@ def test_damaged_masks_are_named_and_corrected(ball_seen):
     ]
     assert volume[1] < 0.6 * volume[0]  # single masks carve too much
     assert abs(volume[2] / volume[0] - 1) < 0.05
+
+
+@pytest.mark.usefixtures("coarse")
+def test_nothing_stays_of_a_removed_piece_and_the_outline_of_the_object_does(ball_seen):
+    """One mask, with soft edges, also has a pedestal under the ball and a block beside it."""
+    model, sphere, masks = ball_seen
+    scale = 8
+    calibrations = model.calibrations * [[[scale], [scale], [1]]]
+    calibrations[:, :2, 2] += (scale - 1) / 2
+    true = np.kron(masks[0], np.ones((scale, scale)))
+    soft = ndimage.gaussian_filter(true, 2.0)
+    damaged = true.copy()
+    damaged[580:, 300:468] = damaged[40:200, 560:736] = 1
+    damaged = ndimage.gaussian_filter(damaged, 2.0)
+    found = consistency.agree(
+        [damaged if row == 13 else soft for row in range(len(masks))], replace(model, calibrations=calibrations), sphere
+    )
+    assert found.wrong == [13]
+    mended, away = found.masks[13], ndimage.distance_transform_edt(true == 0)
+    assert mended[away > 24].max() < 0.01, "beyond the voxels of the hull, and two pixels of 240 for its silhouette"
+    inside = ndimage.distance_transform_edt(true) > 1.5
+    assert mended[inside].min() > 0.5
+    apart = (np.arange(768)[:, None] < 560) & (away < 8)  # from the pedestal
+    np.testing.assert_array_equal(mended[apart], damaged[apart])
 
 
 @pytest.mark.usefixtures("coarse")
