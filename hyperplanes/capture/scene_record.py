@@ -77,7 +77,7 @@ class SceneRecord:
             new: files that will be written. Masks that are the same already are not returned.
         """
         written = self._masks()
-        names = {name for name in self.listed() | set(new) if name.startswith("masks/")}
+        names = {name for name in self.listed() | set(new) | set(written) if name.startswith("masks/")}
         found = []
         for name in sorted(names):
             if (self.folder / name).is_file():
