@@ -23,6 +23,7 @@ from hyperplanes.capture.photographs import (
 )
 from hyperplanes.capture.placement import Placement, find_up, object_points, object_sphere
 from hyperplanes.capture.scene import Captured, straightened, write_scene
+from hyperplanes.capture.scene_record import SceneRecord, checksums
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages, fingerprint
 from hyperplanes.capture.structure_from_motion import ATTEMPTS, EXHAUSTIVE, Picture, Progress, find_poses
@@ -84,7 +85,16 @@ class _Work:
     stages: Stages
     settings: Settings
     progress: Progress
+    sources: list[str] = field(default_factory=list)
+    """The checksums of the photographs, or that of the video."""
     notes: list[str] = field(default_factory=list)
+    originals: dict[str, str] = field(default_factory=dict)
+    """The name of the photograph from which each file of the stage `pictures` was made; the progress names it."""
+
+    @property
+    def record(self) -> SceneRecord:
+        """The record of the scene, in the folder of the stages."""
+        return SceneRecord(self.stages.folder.parent, self.stages.folder / "scene.json")
 
 
 def capture(
@@ -96,7 +106,7 @@ def capture(
         source: a folder of photographs, which may contain masks/, or a video.
         out: the folder of the scene. The results of stages are kept in its folder capture/, so that the same call
             continues an interrupted one. No photograph may lie in its folders images/, masks/ and capture/, in which
-            files are replaced.
+            files are replaced. Masks in it that were changed by hand are kept. A scene of other photographs is refused.
         settings: of the capture.
         progress: called during the work.
 
@@ -107,7 +117,13 @@ def capture(
     source, out, settings = Path(source), Path(out), settings or Settings()
     check_mask(settings.mask)
     _refuse_inside(out, source)
-    work = _Work(Stages(out / WORK), settings, progress or (lambda stage, done, total, text: None))
+    originals = dict[str, str]()
+
+    def named(stage: str, done: int, total: int, text: str) -> None:
+        if progress is not None:
+            progress(stage, done, total, originals.get(text, text))
+
+    work = _Work(Stages(out / WORK), settings, named, originals=originals)
     photographs, is_video = _photographs(source, work)
     if not is_video:
         _refuse_inside(out, *(path for one in photographs for path in (one.path, one.mask) if path is not None))
@@ -120,7 +136,7 @@ def capture(
     straight, given = _straight(model, pictures, opacities, work)
     masks, how = _masks(model, straight, given, [one.name for one in kept], work)
     placement, masks = _placed(model, kept, straight, masks, given, work)
-    return _written(out, model, kept, straight, masks, how, placement, work)
+    return _written(model, kept, straight, masks, how, placement, work)
 
 
 def _refuse_inside(out: Path, *sources: Path) -> None:
@@ -141,6 +157,7 @@ def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
     """The photographs, and whether they are the frames of a video."""
     is_video = source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES
     if is_video:
+        _begin_scene(work, [source], [f"frame_{index:04d}" for index in range(work.settings.frames)])
         stamp = source.stat()
         key = fingerprint(str(source.resolve()), stamp.st_size, stamp.st_mtime, work.settings.frames)
         if work.stages.begin("frames", key) is None:
@@ -163,7 +180,26 @@ def _photographs(source: Path, work: _Work) -> tuple[list[Photograph], bool]:
         found += f" ({'; '.join(notes)})" if notes else ""
         wanted = f"at least {MIN_PHOTOGRAPHS} different photographs that can be read"
         raise DataError(source, wanted, found, "add photographs from other viewpoints")
+    if not is_video:
+        _begin_scene(work, [one.path for one in photographs], [one.name for one in photographs])
     return photographs, is_video
+
+
+def _begin_scene(work: _Work, paths: Sequence[Path], names: Sequence[str]) -> None:
+    """Note the checksums of the photographs or the video, before anything in the scene is replaced.
+
+    Raises:
+        DataError: there is a scene of other photographs, or one with masks that were changed by hand and now none.
+    """
+    work.sources += checksums(paths)
+    work.record.check_photographs(work.sources, names)
+    if work.settings.mask == "none" and (kept := work.record.changed({})):
+        raise DataError(
+            "--mask none",
+            f"a scene without masks in {work.record.folder}, or only those that capture wrote",
+            f"{len(kept)} that {'was' if len(kept) == 1 else 'were'} changed by hand",
+            "name another folder, or delete masks/",
+        )
 
 
 def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photograph], list[Picture], dict[int, Path]]:
@@ -216,6 +252,7 @@ def _pictures(photographs: list[Photograph], work: _Work) -> tuple[list[Photogra
         camera = cameras.setdefault((one.camera, size), len(cameras))
         focal = None if one.focal is None else one.focal * max(size)
         pictures.append(Picture(f"{index:05d}.jpg", camera, size, focal))
+        work.originals[pictures[-1].file] = one.path.name
     opacities = {row: folder / f"{index:05d}.mask.png" for row, index in enumerate(readable) if index in done["masked"]}
     return [photographs[index] for index in readable], pictures, opacities
 
@@ -366,7 +403,6 @@ def _placed(
 
 
 def _written(
-    out: Path,
     model: SparseModel,
     photographs: Sequence[Photograph],
     straight: list[Pixels],
@@ -384,7 +420,12 @@ def _written(
         if masks is not None:
             files[f"masks/{one.name}.png"] = encode_png((masks[row] * 255).round().astype(np.uint8))
     captured = write_scene(
-        out, moved, [one.name for one in photographs], [picture.shape[:2] for picture in straight], files
+        work.record,
+        work.sources,
+        moved,
+        [one.name for one in photographs],
+        [picture.shape[:2] for picture in straight],
+        files,
     )
     work.progress("writing", len(straight), len(straight), "scene")
-    return replace(captured, mask=how, up_from=placement.up_from, notes=tuple(work.notes))
+    return replace(captured, mask=how, up_from=placement.up_from, notes=(*work.notes, *captured.notes))

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from hyperplanes.capture.scene_record import SceneRecord
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.data.formats.scenes.transforms_document import transforms_document
 from hyperplanes.data.pictures.undistort import undistort
 from hyperplanes.utilities.files.encoding import encode_ply
-from hyperplanes.utilities.files.reading import DataError, read_json
 from hyperplanes.utilities.files.writing import write_json, write_whole
+from hyperplanes.utilities.messages.formatting import counted
 
 __all__ = ["Captured", "straightened", "write_scene"]
 
@@ -78,26 +79,39 @@ def straightened(
 
 
 def write_scene(
-    folder: Path, model: SparseModel, names: Sequence[str], sizes: Sequence[tuple[int, int]], files: dict[str, bytes]
+    record: SceneRecord,
+    sources: Collection[str],
+    model: SparseModel,
+    names: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
+    files: dict[str, bytes],
 ) -> Captured:
     """Write the files of a scene, transforms.json last.
 
     Args:
-        folder: of the scene. Images and masks that an earlier transforms.json in it lists are deleted.
+        record: of the scene. Images and masks that an earlier transforms.json in it lists are deleted, except for masks
+            that were changed since they were written.
+        sources: the checksums of the photographs.
         model: in a world with z up, in which the unit sphere contains the object.
         names: of the images without suffix, one per camera.
         sizes: (height, width) of each image.
         files: the encoded images, and masks if there are any, by their paths in the folder.
 
     Returns:
-        A summary of the scene.
+        A summary of the scene, with a note if masks were kept.
     """
-    former = _listed(folder / "transforms.json") - set(files)
+    folder, kept = record.folder, record.changed(files)
+    written = {name: data for name, data in files.items() if name not in kept}
+    former = record.listed() - set(files) - set(kept)
+    record.begin(sources, written)
     (folder / "transforms.json").unlink(missing_ok=True)
     for name in former:
         if (folder / name).is_file():
             (folder / name).unlink()
-    for name, data in files.items():
+    if not any(name.startswith("masks/") for name in files):
+        with suppress(OSError):  # a folder that is absent, or holds other files
+            (folder / "masks").rmdir()
+    for name, data in written.items():
         write_whole(folder / name, data, durable=False)
     write_whole(folder / POINT_CLOUD_FILE, encode_ply(model.points, model.colours), durable=False)
     world_from_camera = np.linalg.inv(model.camera_from_world)
@@ -111,15 +125,7 @@ def write_scene(
         if f"masks/{name}.png" in files:
             frame["mask_path"] = f"masks/{name}.png"
     write_json(folder / "transforms.json", document | {"up": "z", "ply_file_path": POINT_CLOUD_FILE})
-    return Captured(folder, len(names), len(model.points), model.reprojection_error)
-
-
-def _listed(document: Path) -> set[str]:
-    """The images and masks that an earlier transforms.json lists: images/NAME and masks/NAME."""
-    try:
-        frames = read_json(document).get("frames")
-    except DataError:
-        return set()
-    entries = [each for each in frames if isinstance(each, dict)] if isinstance(frames, list) else []
-    names = [str(each[key]) for each in entries for key in ("file_path", "mask_path") if key in each]
-    return {name for name in names if re.fullmatch(r"(images|masks)/[^/\\]+", name)}
+    record.finish(sources, written)
+    note = f"kept {counted(len(kept), 'mask')} that {'was' if len(kept) == 1 else 'were'} changed by hand; delete "
+    note += f"{'it' if len(kept) == 1 else 'them'} to have {'it' if len(kept) == 1 else 'them'} made again"
+    return Captured(folder, len(names), len(model.points), model.reprojection_error, notes=(note,) if kept else ())

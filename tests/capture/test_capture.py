@@ -45,7 +45,7 @@ def scene(staged, tmp_path_factory):
     (folder / "photos" / "photo_100.jpg").write_bytes(b"broken")
     shown = []
     captured = capture(
-        folder / "photos", folder / "scene", progress=lambda stage, done, total, text: shown.append((stage, done))
+        folder / "photos", folder / "scene", progress=lambda stage, done, total, text: shown.append((stage, done, text))
     )
     return captured, shown
 
@@ -108,7 +108,9 @@ def test_a_mask_is_undistorted_independently_of_the_image():
 def test_omitted_photographs_are_named_and_all_stages_are_reported(scene):
     captured, shown = scene
     assert [note for note in captured.notes if "photo_100.jpg" in note]
-    assert {"photographs", "features", "matches", "poses", "writing"} <= {stage for stage, _ in shown}
+    assert {"photographs", "features", "matches", "poses", "writing"} <= {stage for stage, _, _ in shown}
+    for name in ("photographs", "features", "lens"):  # by their own names, not those of the files in capture/
+        assert {text for each, done, text in shown if each == name and done == 0} == {"photo_000.jpg"}
 
 
 @needs_pycolmap

@@ -1,11 +1,13 @@
 """Source of truth: images generated from known masks."""
 
+import shutil
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
 from hyperplanes.capture import Settings, pipeline
 from hyperplanes.capture.masks import consistency
@@ -155,6 +157,30 @@ def test_damaged_masks_are_named_and_corrected(ball_seen):
 
 
 @pytest.mark.usefixtures("coarse")
+def test_nothing_stays_of_a_removed_piece_and_the_outline_of_the_object_does(ball_seen):
+    """One mask, with soft edges, also has a pedestal under the ball and a block beside it."""
+    model, sphere, masks = ball_seen
+    scale = 8
+    calibrations = model.calibrations * [[[scale], [scale], [1]]]
+    calibrations[:, :2, 2] += (scale - 1) / 2
+    true = np.kron(masks[0], np.ones((scale, scale)))
+    soft = ndimage.gaussian_filter(true, 2.0)
+    damaged = true.copy()
+    damaged[580:, 300:468] = damaged[40:200, 560:736] = 1
+    damaged = ndimage.gaussian_filter(damaged, 2.0)
+    found = consistency.agree(
+        [damaged if row == 13 else soft for row in range(len(masks))], replace(model, calibrations=calibrations), sphere
+    )
+    assert found.wrong == [13]
+    mended, away = found.masks[13], ndimage.distance_transform_edt(true == 0)
+    assert mended[away > 24].max() < 0.01, "beyond the voxels of the hull, and two pixels of 240 for its silhouette"
+    inside = ndimage.distance_transform_edt(true) > 1.5
+    assert mended[inside].min() > 0.5
+    apart = (np.arange(768)[:, None] < 560) & (away < 8)  # from the pedestal
+    np.testing.assert_array_equal(mended[apart], damaged[apart])
+
+
+@pytest.mark.usefixtures("coarse")
 def test_given_masks_are_not_changed_and_others_are_corrected(ball_seen, tmp_path, monkeypatch):
     model, _, masks = ball_seen
     damaged = [mask.copy() for mask in masks]
@@ -193,6 +219,64 @@ def test_an_empty_mask_that_was_given_is_noted(count, ball_seen, tmp_path, monke
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: model)
     captured = pipeline.capture(tmp_path / "photos", tmp_path / "scene", Settings(mask="given"))
     assert "1 empty mask, to be corrected or left out: 3" in captured.notes
+
+
+@pytest.fixture
+def recaptured(ball_seen, tmp_path, monkeypatch):
+    """A scene that was captured with the masks of a ball, and a function that captures it again from a folder."""
+    model, _, masks = ball_seen
+    for place, offset in (("photos", 0), ("others", 100)):
+        (tmp_path / place).mkdir()
+        for row in range(len(masks)):
+            Image.fromarray(np.full((96, 96, 3), row + offset, np.uint8)).save(tmp_path / f"{place}/{row}.png")
+    monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: model)
+    monkeypatch.setattr(pipeline, "choose_masker", lambda *_: (lambda picture, row: masks[row], "disc"))
+
+    def again(place="photos", mask="auto"):
+        return pipeline.capture(tmp_path / place, tmp_path / "scene", Settings(mask=mask))
+
+    assert not again().notes
+    return tmp_path / "scene", again
+
+
+@pytest.mark.usefixtures("coarse")
+def test_masks_that_were_changed_by_hand_are_kept_when_the_scene_is_captured_again(recaptured):
+    scene, again = recaptured
+    assert not again().notes
+    drawn = Image.fromarray(np.eye(96, dtype=np.uint8) * 255)
+    for row in (3, 5):
+        drawn.save(scene / f"masks/{row}.png")
+    by_hand, made = (scene / "masks/3.png").read_bytes(), (scene / "masks/4.png").read_bytes()
+    for _ in range(2):  # also when they were kept before
+        assert again().notes == ("kept 2 masks that were changed by hand; delete them to have them made again",)
+        assert [(scene / f"masks/{row}.png").read_bytes() for row in (3, 4, 5)] == [by_hand, made, by_hand]
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"--mask none: .* found 2 that were changed by hand"):
+            again(mask="none")
+        (scene / "transforms.json").unlink(missing_ok=True)  # as if the writing had been interrupted
+    for row in (3, 5):
+        (scene / f"masks/{row}.png").unlink()
+    assert not again().notes
+    assert (scene / "masks/3.png").read_bytes() != by_hand
+    assert not again(mask="none").notes
+    assert not (scene / "masks").exists()
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.usefixtures("coarse")
+def test_a_scene_of_other_photographs_is_refused(recorded, recaptured):
+    scene, again = recaptured
+    if not recorded:  # names are compared
+        shutil.rmtree(scene / "capture")
+        for path in (scene.parent / "others").iterdir():
+            path.rename(path.with_stem(f"other_{path.stem}"))
+    before = {path: path.read_bytes() for path in scene.rglob("*.*")}
+    said = "--out: expected a new folder or the scene of these photographs, found one of 16 others; name another folder"
+    with pytest.raises(ValueError, match=said):
+        again("others")
+    assert {path: path.read_bytes() for path in scene.rglob("*.*")} == before
+    Image.new("RGB", (96, 96), "white").save(scene.parent / "photos/more.png")  # one more is no other scene
+    again()
 
 
 def test_points_label_the_pixels_in_which_they_are_observed(ball_seen):

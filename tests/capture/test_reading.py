@@ -11,6 +11,9 @@ from hyperplanes.capture import Settings, capture, pipeline
 from hyperplanes.capture.masks import network
 from hyperplanes.capture.photographs import find_photographs, list_photographs, read_upright, without_copies
 from hyperplanes.capture.scene import write_scene
+from hyperplanes.capture.scene_record import SceneRecord
+from hyperplanes.data.formats.recognise import read_posed
+from hyperplanes.utilities.files.encoding import encode_jpeg, encode_png
 from hyperplanes.utilities.files.reading import DataError
 from tests.fuzz.published import Published
 
@@ -233,15 +236,28 @@ def test_other_files_in_the_folders_of_a_scene_are_kept(tmp_path):
     model = Published([np.zeros((10, 12, 4), np.uint8)] * 4, np.stack([np.eye(4)] * 4)).sparse_model()
     names, size = ["0", "1", "2", "3"], [(10, 12)] * 4
     first = {f"{kind}/{name}.{end}": b"1" for kind, end in (("images", "jpg"), ("masks", "png")) for name in names}
-    write_scene(tmp_path, model, names, size, first)
+    write_scene(SceneRecord(tmp_path, tmp_path / "record.json"), (), model, names, size, first)
     (tmp_path / "images" / "thumbs").mkdir()
     (tmp_path / "masks" / "notes.txt").write_text("mine")
     second = {f"images/{name}.jpg": b"2" for name in ["0", "1", "2", "other"]}
-    write_scene(tmp_path, model, ["0", "1", "2", "other"], size, second)
+    write_scene(SceneRecord(tmp_path, tmp_path / "record.json"), (), model, ["0", "1", "2", "other"], size, second)
     left = sorted(
         str(path.relative_to(tmp_path)) for kind in ("images", "masks") for path in (tmp_path / kind).iterdir()
     )
     assert left == sorted([*second, "images/thumbs", "masks/notes.txt"])
+
+
+def test_a_scene_that_is_written_again_without_masks_can_be_read(tmp_path):
+    model = Published([np.zeros((10, 12, 4), np.uint8)] * 4, np.stack([np.eye(4)] * 4)).sparse_model()
+    names, size = ["0", "1", "2", "3"], [(10, 12)] * 4
+    grey = np.full((10, 12, 3), 128, np.uint8)
+    images = {f"images/{name}.jpg": encode_jpeg(grey, 90) for name in names}
+    masks = {f"masks/{name}.png": encode_png(grey[..., 0]) for name in names}
+    write_scene(SceneRecord(tmp_path, tmp_path / "record.json"), (), model, names, size, images | masks)
+    assert read_posed(tmp_path).has_alpha
+    write_scene(SceneRecord(tmp_path, tmp_path / "record.json"), (), model, names, size, images)
+    assert not (tmp_path / "masks").exists()
+    assert not read_posed(tmp_path).has_alpha
 
 
 @pytest.mark.parametrize("wrong", [{"order": "sequnce"}, {"max_size": 0}, {"frames": 2}])

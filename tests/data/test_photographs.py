@@ -103,6 +103,12 @@ def test_masks_of_a_folder_are_found_by_name(scene, tmp_path):
         read_views(folder)
 
 
+def test_an_empty_folder_for_masks_counts_as_none(scene, tmp_path):
+    folder = scene.write(tmp_path, scene.document(), mode="RGB")
+    (tmp_path / "masks").mkdir()
+    assert read_views(folder).masks is None
+
+
 def test_frames_that_are_missing_are_left_out_and_named(scene, tmp_path):
     document = scene.document(train_filenames=scene.names[:5], test_filenames=scene.names[5:])
     folder = scene.write(tmp_path, document)
@@ -207,6 +213,25 @@ def test_for_a_video_without_poses_the_error_says_how_to_get_them(given, tmp_pat
     (tmp_path / "notes.txt").touch()
     with pytest.raises(DataError, match=rf"found a video; find .*: hyperplanes capture {tmp_path}/walk.webm "):
         read_views(tmp_path / given)
+
+
+@pytest.mark.parametrize("image", [None, "images/0.jpg"])
+def test_for_an_unfinished_capture_the_error_says_how_to_continue_it(image, tmp_path):
+    """Also if it was interrupted while it wrote the images."""
+    from hyperplanes.data import open_dataset
+
+    out = tmp_path / "scene"
+    (out / "capture" / "pictures").mkdir(parents=True)
+    (out / "capture" / "pictures.json").write_text('{"key": "1", "done": false}')
+    (out / ".lock").touch()
+    if image is not None:
+        (out / image).parent.mkdir()
+        Image.new("RGB", (8, 8)).save(out / image)
+    said = f"{out}: expected a scene, found an unfinished capture; continue it: hyperplanes capture PHOTOS --out {out}"
+    for action in (read_views, read_task, open_dataset):
+        with pytest.raises(DataError) as caught:
+            action(out)
+        assert str(caught.value) == said
 
 
 def test_heic_photographs_of_a_phone_are_counted(tmp_path):

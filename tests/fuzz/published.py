@@ -8,6 +8,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from hyperplanes.capture.scene import write_scene
+from hyperplanes.capture.scene_record import SceneRecord
 from hyperplanes.capture.sparse_model import SparseModel
 from hyperplanes.capture.stages import Stages
 
@@ -128,6 +129,7 @@ class Published:
             str(path.relative_to(folder / "scratch")): path.read_bytes() for path in (folder / "scratch").rglob("*.*")
         }
         names = [str(index) for index in range(len(self.poses))]
-        write_scene(folder / "scene", self.sparse_model(), names, [(self.height, self.width)] * len(names), files)
+        record = SceneRecord(folder / "scene", folder / "capture.json")
+        write_scene(record, (), self.sparse_model(), names, [(self.height, self.width)] * len(names), files)
         self.sparse_model().save(folder / "work/model.npz")
         Stages(folder / "work").finish("poses", "key", {"count": 4})

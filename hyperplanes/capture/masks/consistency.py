@@ -34,6 +34,7 @@ SETTLED = 0.01  # least gain in intersection over union for which more votes are
 ZOOM = 1.15  # radii of the first hull: the sphere in which it is carved again
 DEEP = 0.05  # of the square root of the object's area: the radius of the disc that a difference must contain
 NEIGHBOUR = np.deg2rad(30)  # a mask is filled only if cameras within this angle look from opposite sides of its camera
+FRINGE = 2  # reduced pixels around a removed part: its soft edge, whose opacity is too low to belong to the part
 DISAGREES = 0.05  # of the object's area: masks with larger differences contradict the others
 
 Mask = Float[np.ndarray, "height width"]
@@ -116,7 +117,9 @@ def agree(
         seen = silhouettes(others.centres(), others, one)[0].numpy()
         lost, extra = _differences(reduced, seen)
         lost &= surrounded[row]
-        mended.append(_mended(masks[row], lost, extra))
+        rest = seen | (reduced & ~extra)
+        fringe = ndimage.binary_dilation(extra, np.ones((3, 3)), FRINGE, mask=~rest)
+        mended.append(_mended(masks[row], lost, extra | fringe))
         disagreement.append((lost.sum() + extra.sum()) / max(1, seen.sum()))
         outlines.append(seen)
     found = Agreement(mended, np.array(disagreement), votes, hull)

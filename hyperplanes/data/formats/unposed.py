@@ -1,4 +1,4 @@
-"""Detect inputs without poses (photographs, videos, archives of apps), and say how to make posed images of them."""
+"""Detect what has no poses (photographs, videos, exports, unfinished captures), and say how posed images are made."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ __all__ = ["find_video", "photographs_folder", "refuse_unposed"]
 
 _HOMES = (".", "images", "input", "rgb", "photos", "image", "rgbd", "keyframes/images")
 _COUNTED = 10_000  # most entries of a folder that are counted
+_FIRST_STAGES = ("pictures", "frames")  # of `hyperplanes capture`, which keeps its stages in capture/ of the scene
 _PHOTOGRAPHS = PICTURE_SUFFIXES | HEIF_SUFFIXES
 _PACKED = frozenset({".zip", ".r3d"})  # Record3D's .r3d is a ZIP archive
 
@@ -20,12 +21,15 @@ def refuse_unposed(path: Path) -> None:
     """Raise an error that says what to do if posed images can be made from what a path holds.
 
     Raises:
-        DataError: the path holds photographs without poses, a video, or an archive.
+        DataError: the path holds an unfinished capture, photographs without poses, a video, or an archive.
     """
     packed = _packed(path)
     if packed is not None:
         remedy = f"unpack it ({command_line('unzip', packed, '-d', 'capture')}), then give that folder"
         raise DataError(path, "the folder of an export", f"{packed.name}, which is packed", remedy)
+    if any((path / "capture" / f"{stage}.json").is_file() for stage in _FIRST_STAGES):
+        remedy = f"continue it: {command_line('hyperplanes', 'capture', 'PHOTOS', '--out', path)}"
+        raise DataError(path, "a scene", "an unfinished capture", remedy)
     home, count = _photographs(path)
     if count:
         raise DataError(

@@ -17,17 +17,17 @@ def find_masks(folders: Sequence[Path], pictures: Sequence[Path], root: Path) ->
     """The mask of each image, found as by `match_masks`; white marks the object.
 
     Args:
-        folders: which may hold masks; the first one that exists is used.
+        folders: which may hold masks; the first one that exists and is not empty is used.
         pictures: the image files, some of which may be missing.
         root: as in `reading.check_regular`.
 
     Returns:
-        A file for each image; None for a missing image, and for all images if none of the folders exists.
+        A file for each image; None for a missing image, and for all images if there is no such folder.
 
     Raises:
         DataError: the folder lacks the mask of an image, or a link leads out of the root.
     """
-    folder = next((folder for folder in folders if folder.is_dir()), None)
+    folder = next((folder for folder in folders if folder.is_dir() and any(folder.iterdir())), None)
     if folder is None or not any(picture.exists() for picture in pictures):
         return [None] * len(pictures)
     masks = match_masks(folder, pictures, root)
