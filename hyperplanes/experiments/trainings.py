@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from hyperplanes.adaptation.checkpoints import packaged_folder
 from hyperplanes.configuration.presets import Preset
@@ -19,9 +19,6 @@ from hyperplanes.experiments.paper.experiment import Experiment, Trained
 from hyperplanes.experiments.workers import Workers
 from hyperplanes.experiments.workspace import Workspace, unique_name
 from hyperplanes.views import Tasks
-
-if TYPE_CHECKING:
-    from hyperplanes.experiments.engine import Runner
 
 __all__ = ["Train", "Trainings"]
 
@@ -142,6 +139,12 @@ class Trainings:
         }
 
 
-def _train(trained: Trained, chosen: Preset, folder: Path, runner: Runner) -> None:
+class _HasTrainings(Protocol):
+    """The object of a worker process, `engine.Runner`."""
+
+    trainings: Trainings
+
+
+def _train(trained: Trained, chosen: Preset, folder: Path, runner: _HasTrainings) -> None:
     trainings = runner.trainings
     trainings.train(trained, chosen, trainings.arranged(trained, chosen), None, folder)

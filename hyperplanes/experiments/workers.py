@@ -14,14 +14,12 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import torch
 
+from hyperplanes.experiments.data_sets import DataSets
 from hyperplanes.utilities.machine.interrupts import interruptible
-
-if TYPE_CHECKING:
-    from hyperplanes.experiments.engine import Runner
 
 __all__ = ["Result", "Workers"]
 
@@ -37,6 +35,12 @@ SAVING = 10.0
 """Seconds that workers have to write checkpoints after SIGTERM."""
 
 
+class HasData(Protocol):
+    """The object with which a process does its work, such as `engine.Runner`."""
+
+    data: DataSets
+
+
 class Workers:
     """A pool of processes, as a context. After an exception in the context, they are ended with SIGTERM.
 
@@ -48,7 +52,7 @@ class Workers:
         ChildProcessError: at the end of the context, if a process was killed.
     """
 
-    def __init__(self, count: int, make: Callable[[], Runner]) -> None:
+    def __init__(self, count: int, make: Callable[[], HasData]) -> None:
         self.count, self._make = count, make
         self._pool: ProcessPoolExecutor | None = None
 
@@ -100,10 +104,10 @@ class Workers:
         return self._pool
 
 
-_runner: Runner  # the object made by `make`, in a worker process
+_runner: HasData  # the object made by `make`, in a worker process
 
 
-def _start(make: Callable[[], Runner]) -> None:
+def _start(make: Callable[[], HasData]) -> None:
     global _runner
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, and the parent ends its workers
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
