@@ -231,10 +231,9 @@ def hull(support: Views, side: int, within: Occupancy | None = None) -> Occupanc
     check_masks(support)
     carved = carve(support.masks, support.cameras, support.bounds, side, within=within)
     if not carved.occupied.any():
-        found = f"{len(support)} of {len(support)} with a pixel set, and no point that all of them may show"
         raise ValueError(
-            f"masks of the support views{_from_to(support.names)}: expected an object, got {found}; "
-            "check alpha and poses, or leave the masks out"
+            f"masks of the support views{_from_to(support.names)}: expected an object, got no point that all of them "
+            "may show; check alpha and poses, or leave the masks out"
         )
     return carved
 

@@ -212,7 +212,7 @@ def test_masks_with_an_empty_hull_are_refused():
     # each mask has a pixel set, but no voxel within the bounds projects to all of them
     apart = torch.zeros_like(views.masks)
     apart[0, 0, 0, 0] = apart[1, 0, -1, -1] = apart[2, 0, 0, -1] = 1.0
-    with pytest.raises(ValueError, match="got 3 of 3 with a pixel set, and no point that all of them may show; check"):
+    with pytest.raises(ValueError, match="got no point that all of them may show; check"):
         hull(replace(views, masks=apart, bounds=Sphere(radius=0.3)), 32)
 
 

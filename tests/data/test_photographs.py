@@ -387,6 +387,10 @@ def test_hardly_opaque_pixels_of_masks_are_transparent(tmp_path):
     """Programs that cut objects out leave 1 or 2 of 255 in the background; 16 is the edge of a supersampled picture."""
     Image.fromarray(np.array([[0, 1, 7, 16, 255]], np.uint8)).save(tmp_path / "mask.png")
     np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), [[0, 0, 0, 16, 255]])
+    edge = np.zeros((20, 20), np.uint8)
+    edge[:, 10], edge[:, 11:] = 3, 255  # of a clean picture: a pixel that the object hardly covers
+    Image.fromarray(edge).save(tmp_path / "edge.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "edge.png"), edge)
 
 
 @pytest.mark.parametrize("orientation", [1, 6])

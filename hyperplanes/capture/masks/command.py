@@ -18,7 +18,7 @@ from hyperplanes.utilities.files.reading import DataError
 
 __all__ = ["Command"]
 
-TIMEOUT_SECONDS = 600  # seconds: time limit for one image
+TIMEOUT_SECONDS = 600  # for one image
 
 
 @dataclass(frozen=True)

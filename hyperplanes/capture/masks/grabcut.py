@@ -20,7 +20,7 @@ __all__ = ["GrabCut", "extended"]
 
 MAX_IMAGE_SIZE = 320  # pixels along the longer side of the images that are segmented
 SEED_RADIUS = 0.012  # of the longer side: radius of the disc that is labelled around a point
-GRABCUT_ITERATIONS = 5  # iterations of GrabCut
+GRABCUT_ITERATIONS = 5
 CERTAIN_DEPTH = 0.03  # of the square root of a mask's area: pixels further inside than this surely belong to the object
 
 

@@ -109,8 +109,9 @@ class SceneReport:
     @property
     def wrong(self) -> list[ViewReport]:
         """The views whose masks fit the hull of all less than half as well as usual: their pose or mask is wrong."""
-        fits = [view.agreement for view in self.views if view.agreement is not None]
-        return [view for view in self.views if view.agreement is not None and view.agreement < median(fits) / 2]
+        fits = {view: view.agreement for view in self.views if view.agreement is not None}
+        usual = median(fits.values()) if fits else 0.0
+        return [view for view, fit in fits.items() if fit < usual / 2]
 
     @property
     def is_sound(self) -> bool:
