@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,6 +20,7 @@ from hyperplanes.geometry.notebooks import show_views
 from hyperplanes.geometry.occupancy import MIN_MASK_OPACITY, Occupancy, carve, full
 from hyperplanes.geometry.rays import Rays
 from hyperplanes.geometry.symmetry.reflections import Symmetry
+from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.footprint import pixels_across
 from hyperplanes.rendering.images import Pictures
@@ -104,6 +105,23 @@ class AdaptedField:
     def without_residuals(self) -> AdaptedField:
         """The same field without residual correction of its pictures (`adaptation.correction.residuals`)."""
         return self
+
+    def with_view_penalty(self, view: int, given: int, penalty: float) -> AdaptedField:
+        """The same field, which prefers other support views to one of them; densities and voxels stay.
+
+        Args:
+            view: the index of that view. Its reflections, which follow the given views, get the penalty as well.
+            given: number of support views, without reflections.
+            penalty: as in `VisibilityPlanes.with_added_penalty`.
+
+        Returns:
+            A field with that penalty; one that does not choose between views is returned unchanged.
+        """
+        own, planes = self.field, getattr(self.field, "planes", None)
+        if not (isinstance(planes, VisibilityPlanes) and is_dataclass(own) and not isinstance(own, type)):
+            return self
+        penalised = planes.with_added_penalty(torch.arange(view, len(planes), given), penalty)
+        return replace(self, field=replace(own, planes=penalised), refined=self.refined_occupancy)
 
     @property
     def dtype(self) -> torch.dtype:

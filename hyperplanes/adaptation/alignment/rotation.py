@@ -93,6 +93,10 @@ class RotatedField(AdaptedField):
         """As `AdaptedField.with_sampling`."""
         return replace(self, sampling=sampling, unrotated=self.unrotated.with_sampling(sampling))
 
+    def with_view_penalty(self, view: int, given: int, penalty: float) -> RotatedField:
+        """As `AdaptedField.with_view_penalty`."""
+        return replace(self, unrotated=self.unrotated.with_view_penalty(view, given, penalty))
+
     @property
     def _back(self) -> Float[Tensor, "4 4"]:
         return self.rotation.inverse.about(self.occupancy.bounds)

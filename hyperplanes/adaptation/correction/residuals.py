@@ -4,6 +4,9 @@ A field cannot reproduce all of its support views: its surfaces are soft, and th
 of each support view, its image minus the picture that the field renders from its camera, is known. Residuals are
 images, so new views blend them as image-based rendering blends colours (Buehler et al. 2001, "Unstructured Lumigraph
 Rendering"): from support views that see the same surface, with more weight the closer their rays are.
+
+A field that reads images reproduces a support view better than any new view, because it reads that view itself. So its
+residual is computed with a penalty on it, as if it were as far away as support views are from a new one.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable, attr
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.chosen_views import PENALTY_RADIANS
 from hyperplanes.geometry.image_planes import ImagePlanes
 from hyperplanes.geometry.rays import Rays, cast, pixel_grid
 from hyperplanes.rendering.compositing import Rendered
@@ -37,7 +41,8 @@ __all__ = ["CorrectedField", "ResidualField", "are_corrected", "corrected_field"
 ANGULAR_FALLOFF = 10.0  # of weights as a function of 1 - the cosine of the angle between rays: a third at 27 degrees
 MAX_COSINE_DISTANCE = 0.5  # value of 1 - cosine from which on the weight is 0: 60 degrees
 DISTANCE_SCALE = 0.25  # distance from the surface that a support view sees, in radii, at which the weight is 1 / e
-DOUBT = 0.3  # weight of a residual of zero
+DOUBT = 0.1  # weight of a residual of zero
+OWN_VIEW_ANGLE = 0.4  # radians that a support view counts as farther away when its own residual is computed
 MIN_CORRECTED_OPACITY = 0.01  # from which on a pixel is corrected in part
 FULL_CORRECTION_OPACITY = 1 / 3  # and in full
 PAIR_CHUNK = 1 << 18  # of a pixel and a support view, processed at once
@@ -148,6 +153,12 @@ class ResidualField:
         cosines = (torch.nn.functional.normalize(offsets, dim=-1) * directions[:, None]).sum(-1)
         return (1 - cosines < MAX_COSINE_DISTANCE).any(0)
 
+    def _beside(self, view: int) -> Renderable:
+        """The field, which reads a support view as if it stood OWN_VIEW_ANGLE farther away."""
+        if not isinstance(self.uncorrected, AdaptedField):
+            return self.uncorrected
+        return self.uncorrected.with_view_penalty(view, len(self.views), OWN_VIEW_ANGLE / PENALTY_RADIANS)
+
     def _compute(self, chosen: list[int]) -> None:
         """Computes residual, depth times opacity, and opacity of the chosen support views, unless done already.
 
@@ -158,7 +169,7 @@ class ResidualField:
             for view in chosen:
                 if view in self._known:
                     continue
-                own = self.uncorrected.render(camera.select(self._planes.cameras, [view]))
+                own = self._beside(view).render(camera.select(self._planes.cameras, [view]))
                 lacking = self.views.images[[view]].to(own.images) - own.images
                 maps = torch.cat([lacking, own.depth * own.opacity, own.opacity], 1)
                 self._planes.images[view] = maps[0].to(self._planes.images)
@@ -186,6 +197,10 @@ class CorrectedField(AdaptedField):
     def without_residuals(self) -> AdaptedField:
         """As `AdaptedField.without_residuals`."""
         return self.uncorrected
+
+    def with_view_penalty(self, view: int, given: int, penalty: float) -> CorrectedField:
+        """This field: residuals that are corrected again are those of its pictures."""
+        return self
 
     def with_sampling(self, sampling: Sampler) -> AdaptedField:
         """As `AdaptedField.with_sampling`; without correction if the sampler is another one."""

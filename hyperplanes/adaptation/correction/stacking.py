@@ -79,6 +79,11 @@ class StackedField(AdaptedField):
             self, sampling=own or self.sampling, other=self.other.with_sampling(other) if other else self.other
         )
 
+    def with_view_penalty(self, view: int, given: int, penalty: float) -> AdaptedField:
+        """As `AdaptedField.with_view_penalty`, of both fields."""
+        own = super().with_view_penalty(view, given, penalty)
+        return replace(own, other=self.other.with_view_penalty(view, given, penalty))
+
     @without_autocast
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:
         """As `AdaptedField.trace`, averaged over both fields."""

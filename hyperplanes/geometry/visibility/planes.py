@@ -132,6 +132,17 @@ class VisibilityPlanes:
         """
         return self._with(offsets=offsets.to(self._view_penalties.offsets))
 
+    def with_added_penalty(self, views: Selection, penalty: float) -> VisibilityPlanes:
+        """The same planes with a penalty added to the offsets of some views.
+
+        Args:
+            views: their indices, or a boolean for each view.
+            penalty: 1 is worth PENALTY_RADIANS radians of angle.
+        """
+        offsets = self._view_penalties.offsets.clone()
+        offsets[views] += penalty
+        return self._with(offsets=offsets)
+
     def _with(self, **changes: Any) -> VisibilityPlanes:
         """The same planes with other view penalties."""
         result = copy.copy(self)
