@@ -15,6 +15,7 @@ import torch
 from benchmarks.parts.objects import held_out
 from hyperplanes.adaptation import HullBlend, HyperPlanes, ResidualField, diagnose, swap_gap
 from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
+from hyperplanes.adaptation.correction import residuals
 from hyperplanes.adaptation.correction.stacking import StackedField
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.optimisation import learned_steps
@@ -431,8 +432,8 @@ def test_the_loss_of_few_rays_by_contrast_varies_less():
     assert abs(means[1] - means[0]) < spreads[0] / 25**0.5 * 3
 
 
-def test_residuals_raise_psnr_and_residuals_of_shuffled_views_lower_it():
-    """Measured: 0.6 dB gained; residuals of views in another order lose 19 dB."""
+def test_residuals_raise_psnr_and_residuals_of_shuffled_views_lower_it(monkeypatch):
+    """Measured: 0.9 dB gained, 0.8 dB if each view reads itself; residuals of views in another order lose 19 dB."""
     support, field = shape().support, composition(25)
     order = torch.randperm(len(support), generator=torch.Generator().manual_seed(0)).tolist()
     shuffled = replace(support, images=support.images[order])
@@ -441,6 +442,8 @@ def test_residuals_raise_psnr_and_residuals_of_shuffled_views_lower_it():
     )
     assert corrected > plain + 0.2
     assert wrong < plain - 5
+    monkeypatch.setattr(residuals, "OWN_VIEW_ANGLE", 0.0)
+    assert corrected > quality(ResidualField(field, support), shape()) + 0.04
 
 
 def test_stacking_raises_psnr_of_a_fine_tuned_lamp():

@@ -10,16 +10,18 @@ from threading import Thread
 import pytest
 import torch
 
-from hyperplanes.adaptation import CorrectedField, HyperPlanes, ResidualField
+from hyperplanes.adaptation import CorrectedField, HullBlend, HyperPlanes, ResidualField
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.correction import residuals
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.swapped import Swapped
+from hyperplanes.adaptation.symmetry.reflections import with_reflections
 from hyperplanes.commands.inputs.disk_cache import keep_field, recall_field
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast
+from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.rendering import RayMarching
 from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
@@ -284,6 +286,30 @@ def test_a_model_corrects_the_pictures_of_its_fields(many, query, azimuth):
     rays, _, _ = query.rays_at(torch.arange(40))
     assert torch.equal(field.trace(rays).colour, plain.trace(rays).colour)
     assert not isinstance(field.with_sampling(RayMarching(12)), CorrectedField)
+
+
+@pytest.mark.parametrize("name", ["hull_blend", "stacked", "rotated"])
+def test_a_view_with_a_penalty_is_hardly_read_for_its_own_picture(many, name):
+    """Views of noise, so that it shows which of them a picture comes from."""
+    noise = torch.rand(many.images.shape, generator=torch.Generator().manual_seed(0))
+    views = replace(many, images=torch.where(many.masks > 0.5, noise, many.images))
+    made = {"stacked": test_stacking.model(), "rotated": model(azimuth=0.7).without_residuals()}
+    field = HullBlend().adapt(views) if name == "hull_blend" else made[name].adapt(views)
+    penalised = field.with_view_penalty(3, len(views), 1.0)
+    one = camera.select(views.cameras, [3])
+    errors = [(each.render(one).images - views.images[[3]]).square().mean() for each in (field, penalised)]
+    assert errors[1] > 1.3 * errors[0]
+    points = 0.6 * torch.rand(200, 3, generator=torch.Generator().manual_seed(1)) - 0.3
+    assert torch.equal(penalised.density(points), field.density(points))
+
+
+def test_reflections_of_a_view_get_its_penalty_and_fields_that_choose_no_views_stay():
+    views = with_reflections(ball_views(ring(3, SIZE)), Symmetry(Plane((1.0, 0.0, 0.0))))
+    field = HullBlend().adapt(views).with_view_penalty(1, 3, 0.5)
+    seen = field.field.planes.choose(torch.zeros(1, 3), best=6).best
+    assert sorted(seen.views[0, -2:].tolist()) == [1, 4]
+    grey = ball((0.5, 0.5, 0.5))
+    assert grey.with_view_penalty(0, 3, 0.5) is grey
 
 
 def test_a_model_without_residuals_is_another_one_with_the_same_weights(many):
