@@ -171,7 +171,7 @@ def test_a_swapped_update_is_followed_by_learned_steps():
 
 def test_training_gives_a_step_that_improves_query_views_and_does_not_change_the_model(monkeypatch):
     adapter, data = stepping(1), Balls(views=6)
-    config = TrainingConfig(steps=14, tasks=1, rays=64, views=(2, 3, 4), held_out=0)
+    config = TrainingConfig(steps=8, tasks=1, rays=64, views=(2, 3, 4), held_out=0)
     before, done = {name: value.clone() for name, value in adapter.state_dict().items()}, []
     with monkeypatch.context() as patch:
         patch.setattr(training, "WARMUP", 1)
@@ -179,7 +179,7 @@ def test_training_gives_a_step_that_improves_query_views_and_does_not_change_the
         patch.setattr(training, "GRADIENT_RAYS", 128)
         patch.setattr(learned_steps, "PARTS", 1)
         fitted = fit_learned_step(adapter, data, config, on_step=lambda step, loss: done.append(step))
-    assert done == list(range(1, 15))
+    assert done == list(range(1, 9))
     assert not any(value.requires_grad for value in fitted.parameters())
     assert all(torch.equal(value, before[name]) for name, value in adapter.state_dict().items())
     # evaluated on a held-out object
@@ -188,7 +188,7 @@ def test_training_gives_a_step_that_improves_query_views_and_does_not_change_the
         adapter.learned_step, adapter.config = fitted, replace(adapter.config, learned_steps=steps)
         pictures = adapter.adapt(task.support[:3]).render(task.query.cameras).images
         errors.append(float((pictures - task.query.images).square().mean()))
-    assert errors[1] < errors[0] - 5e-5  # measured: 7e-5, and 7e-7 with an untrained step
+    assert errors[1] < errors[0] - 4e-5  # measured: 5.6e-5, and 7e-7 with an untrained step
 
 
 def test_training_starts_from_the_step_of_the_model(monkeypatch):

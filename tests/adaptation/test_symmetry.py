@@ -97,6 +97,17 @@ def test_the_plane_of_a_symmetric_object_is_found(count):
     assert math.dist((*found.plane.normal, found.plane.offset), (1.0, 0.0, 0.0, 0.0)) < (0.01 if count >= 10 else 1e-9)
 
 
+@pytest.fixture
+def coarse(monkeypatch):
+    """Evaluate planes with small images, as in the search, and few voxels, which takes a quarter of the time."""
+    of, size, side = SymmetryJudge.of, judging_symmetry.COARSE_SIZE, 32
+    monkeypatch.setattr(SymmetryJudge, "of", lambda views, *_: of(views, size, side))
+    monkeypatch.setattr(symmetry, "carved", partial(carved, side=side))
+    for module in (symmetry, reflections):
+        monkeypatch.setattr(module, "HULL_SIDE", side)
+
+
+@pytest.mark.usefixtures("coarse")
 def test_with_many_views_a_plane_beside_the_centre_is_found():
     found = symmetry_of(balls(cameras(12), BODY, Sphere((0.012, 0.0, 0.0))))
     assert found is not None
@@ -116,13 +127,6 @@ def test_with_many_views_a_tilted_plane_is_found():
 
 
 @pytest.fixture
-def coarse(monkeypatch):
-    """Evaluate planes with small images and few voxels, as in the search, which takes a third of the time."""
-    of, size, side = SymmetryJudge.of, judging_symmetry.COARSE_SIZE, judging_symmetry.COARSE_HULL
-    monkeypatch.setattr(SymmetryJudge, "of", lambda views, *_: of(views, size, side))
-
-
-@pytest.fixture
 def across_alone(monkeypatch):
     """Do not search for planes of other azimuths."""
     monkeypatch.setattr(
@@ -139,6 +143,7 @@ def test_the_plane_goes_through_the_centre_of_the_scene():
     assert symmetry_of(balls(cameras(), placed, Sphere((0.3, 0.0, 0.0)))) is None
 
 
+@pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize("count", [3, 12])
 def test_the_plane_of_a_rotated_object_is_found(count):
     """With few views by the errors of planes of all azimuths, with ten or more by the hull."""
@@ -150,6 +155,7 @@ def test_the_plane_of_a_rotated_object_is_found(count):
     assert abs(found.plane.offset) < 0.02
 
 
+@pytest.mark.usefixtures("coarse")
 def test_with_few_views_a_plane_beside_the_centre_is_found():
     placed = [((x + 0.05, y, z), radius, colour) for (x, y, z), radius, colour in BODY]
     found = symmetry_of(Rotation(0.5).views(balls(cameras(), placed)))
@@ -234,6 +240,7 @@ def test_of_planes_with_similar_errors_the_first_is_chosen():
     assert symmetry._least({ACROSS.plane: 1.05, ALONG.plane: 1.0}) == ALONG.plane
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_horizontal_plane_has_order_1():
     placed = [((0.2, 0.35, 0.1), 0.3, RED), ((0.2, -0.35, 0.1), 0.3, RED), ((-0.3, 0.0, -0.2), 0.2, BLUE)]
     assert symmetry_of(balls(cameras(4), placed)) == Symmetry(Plane((0.0, 1.0, 0.0)))
@@ -254,6 +261,7 @@ def test_the_number_of_planes_is_limited_by_the_number_of_pixels(monkeypatch):
     assert symmetry_of(views).order == 6
 
 
+@pytest.mark.usefixtures("coarse")
 def test_all_planes_of_a_rotated_object_are_found_and_meet_at_the_centre():
     found = symmetry_of(Rotation(0.5).views(balls(cameras(2, SMOOTH), around(4, [RED]))))
     assert found is not None
@@ -318,6 +326,7 @@ def test_without_a_plane_the_views_are_unchanged():
     assert torch.equal(with_reflections(replace(views, masks=None), ACROSS).images, plain.images)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_an_asymmetric_part_is_in_the_hull_only_at_its_place():
     views = balls(cameras(8), [*BODY, ANTENNA])
     assert symmetry_of(views) == ACROSS
@@ -339,6 +348,7 @@ def test_reflections_of_a_symmetric_object_have_no_unknown_pixels():
     torch.testing.assert_close(found.images, torch.cat([views.images, views.images.flip(3)]))
 
 
+@pytest.mark.usefixtures("coarse")
 def test_reflections_improve_the_hull_blend_of_sides_that_no_view_sees():
     others = balls(cameras(16, SMALL), BODY)
     from_left = [index for index, each in enumerate(others.cameras.extrinsics) if float(each[2, 0]) > 0.3][:3]
@@ -347,6 +357,7 @@ def test_reflections_improve_the_hull_blend_of_sides_that_no_view_sees():
     assert psnr(both, others.images).mean() > psnr(alone, others.images).mean() + 1
 
 
+@pytest.mark.usefixtures("coarse")
 def test_the_hull_of_views_and_reflections_prefers_views():
     views = balls(cameras(), BODY)
     planes = ReflectedHullBlend().adapt(views).field.planes
@@ -357,6 +368,7 @@ def test_the_hull_of_views_and_reflections_prefers_views():
     assert seen.penalty[seen.views >= len(views)].min() == pytest.approx(REFLECTION_PENALTY)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_model_uses_reflections_as_views_with_a_penalty_offset():
     views = balls(cameras(), BODY)
     symmetric, plain = model(), model()
@@ -517,6 +529,7 @@ def test_errors_of_all_folds_are_summed(monkeypatch, better):
     assert (len(folds), len(held_out), len(set(held_out))) == (3, 6, 6)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_held_out_views_distinguish_the_plane_from_a_wrong_one():
     views = balls(cameras(16), BODY)
     assert symmetry._held_out_gain(views, ACROSS) > symmetry.GAIN > symmetry._held_out_gain(views, ALONG)
@@ -544,10 +557,7 @@ def test_weights_of_one_object_have_the_precision_of_the_model():
 
 
 @pytest.mark.usefixtures("coarse")
-def test_two_threads_find_the_same_symmetry_as_one(monkeypatch):
-    monkeypatch.setattr(symmetry, "carved", partial(carved, side=32))
-    for module in (symmetry, reflections):
-        monkeypatch.setattr(module, "HULL_SIDE", 32)
+def test_two_threads_find_the_same_symmetry_as_one():
     views, found = balls(cameras(10, SMALL), BODY), []
     before = torch.get_num_threads()
     try:

@@ -101,14 +101,19 @@ def coarse(monkeypatch):
     monkeypatch.setattr(consistency, "FINE_SIDE", 96)
 
 
-@pytest.fixture(scope="module")
-def ball_seen():
-    """A ball seen by 16 cameras around it: the model, its sphere and its masks."""
+@pytest.fixture
+def coarser(monkeypatch):
+    """Use even fewer, where the masks need no correction."""
+    monkeypatch.setattr(consistency, "COARSE_SIDE", 24)
+    monkeypatch.setattr(consistency, "FINE_SIDE", 48)
+
+
+def ball_seen_by(count, size=96):
+    """A ball seen by cameras around it: the model, its sphere and its masks."""
     from hyperplanes.capture.sparse_model import SparseModel
     from hyperplanes.geometry import cameras as camera
     from hyperplanes.geometry.rays import Sphere
 
-    count, size = 16, 96
     poses = camera.orbit(count, 3.0, 0.3).numpy().astype(float)
     calibration = np.tile(np.array([[110.0, 0, 47.5], [0, 110.0, 47.5], [0, 0, 1]]), (count, 1, 1))
     model = SparseModel(
@@ -118,6 +123,11 @@ def ball_seen():
     rows, columns = np.mgrid[:size, :size]
     mask = np.hypot(rows - 47.5, columns - 47.5) < 110 * 0.7 / np.sqrt(9 - 0.49)
     return model, Sphere(radius=1.1), [mask.astype(float) for _ in range(count)]
+
+
+@pytest.fixture(scope="module")
+def ball_seen():
+    return ball_seen_by(16)
 
 
 def test_consistent_masks_are_not_changed(ball_seen, monkeypatch):
@@ -203,17 +213,13 @@ def test_given_masks_are_not_changed_and_others_are_corrected(ball_seen, tmp_pat
     assert [note for note in captured.notes if "contradict" in note] == said
 
 
-@pytest.mark.parametrize("count", [6, 16])
-@pytest.mark.usefixtures("coarse")
-def test_an_empty_mask_that_was_given_is_noted(count, ball_seen, tmp_path, monkeypatch):
+@pytest.mark.parametrize("count", [6, 8])
+@pytest.mark.usefixtures("coarser")
+def test_an_empty_mask_that_was_given_is_noted(count, tmp_path, monkeypatch):
     """Also with fewer than eight photographs, whose masks are not compared with each other."""
-    model, _, masks = ball_seen
-    model = replace(
-        model,
-        **{name: getattr(model, name)[:count] for name in ("pictures", "camera_from_world", "calibrations", "lenses")},
-    )
+    model, _, masks = ball_seen_by(count)
     (tmp_path / "photos/masks").mkdir(parents=True)
-    for row, mask in enumerate(masks[:count]):
+    for row, mask in enumerate(masks):
         Image.fromarray(np.full((96, 96, 3), row, np.uint8)).save(tmp_path / f"photos/{row}.png")
         Image.fromarray((255 * mask * (row != 3)).astype(np.uint8)).save(tmp_path / f"photos/masks/{row}.png")
     monkeypatch.setattr(pipeline, "find_poses", lambda *_, **__: model)
@@ -222,9 +228,9 @@ def test_an_empty_mask_that_was_given_is_noted(count, ball_seen, tmp_path, monke
 
 
 @pytest.fixture
-def recaptured(ball_seen, tmp_path, monkeypatch):
+def recaptured(tmp_path, monkeypatch):
     """A scene that was captured with the masks of a ball, and a function that captures it again from a folder."""
-    model, _, masks = ball_seen
+    model, _, masks = ball_seen_by(consistency.MIN_MASKS)
     for place, offset in (("photos", 0), ("others", 100)):
         (tmp_path / place).mkdir()
         for row in range(len(masks)):
@@ -239,7 +245,7 @@ def recaptured(ball_seen, tmp_path, monkeypatch):
     return tmp_path / "scene", again
 
 
-@pytest.mark.usefixtures("coarse")
+@pytest.mark.usefixtures("coarser")
 def test_masks_that_were_changed_by_hand_are_kept_when_the_scene_is_captured_again(recaptured):
     scene, again = recaptured
     assert not again().notes
@@ -263,7 +269,7 @@ def test_masks_that_were_changed_by_hand_are_kept_when_the_scene_is_captured_aga
 
 
 @pytest.mark.parametrize("recorded", [True, False])
-@pytest.mark.usefixtures("coarse")
+@pytest.mark.usefixtures("coarser")
 def test_a_scene_of_other_photographs_is_refused(recorded, recaptured):
     scene, again = recaptured
     if not recorded:  # names are compared
@@ -271,7 +277,7 @@ def test_a_scene_of_other_photographs_is_refused(recorded, recaptured):
         for path in (scene.parent / "others").iterdir():
             path.rename(path.with_stem(f"other_{path.stem}"))
     before = {path: path.read_bytes() for path in scene.rglob("*.*")}
-    said = "--out: expected a new folder or the scene of these photographs, found one of 16 others; name another folder"
+    said = "--out: expected a new folder or the scene of these photographs, found one of 8 others; name another folder"
     with pytest.raises(ValueError, match=said):
         again("others")
     assert {path: path.read_bytes() for path in scene.rglob("*.*")} == before

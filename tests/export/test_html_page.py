@@ -67,7 +67,7 @@ def small(views):
     """A fragment of a page that renders quickly."""
     tiny = bake(AdaptedField(two_balls, full(SPHERE, 8), RayMarching(16)), side=8)
     fragment = page_of(tiny, views, picture=encode_animation(to_pixels(views.images[:1]), "webp"))
-    return f'<div style="width:40px;float:left">{fragment}</div>'
+    return f'<div style="width:16px;float:left">{fragment}</div>'
 
 
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
@@ -86,26 +86,26 @@ def test_the_page_shows_the_same_picture_as_the_baked_scene(baked, views, tmp_pa
 
 
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_a_wide_window_shows_the_whole_object_of_tall_pictures(baked, views, tmp_path):
+def test_a_wide_window_shows_the_whole_object_of_tall_pictures(coarse, views, tmp_path):
     tall = camera.pinhole(camera.symmetric_intrinsics(96, 48, 0.4), camera.camera_from_world(views.cameras), 96, 48)
-    page = save_page(page_of(baked, Views(torch.ones(6, 3, 96, 48), tall, bounds=SPHERE)), tmp_path / "page.html", "")
+    page = save_page(page_of(coarse, Views(torch.ones(6, 3, 96, 48), tall, bounds=SPHERE)), tmp_path / "page.html", "")
     picture = tmp_path / "shot.png"
     flags = [flag for flag in FLAGS if "window-size" not in flag]
-    place = [f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}", "--window-size=800,300"]
+    place = [f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}", "--window-size=500,190"]
     command = [str(chromium), *flags, *place, page.resolve().as_uri()]
     subprocess.run(command, check=True, capture_output=True, timeout=300)
-    drawn = (np.array(Image.open(picture).convert("RGB")).astype(int).min(-1) < 200)[:260]  # above the caption
+    drawn = (np.array(Image.open(picture).convert("RGB")).astype(int).min(-1) < 200)[:150]  # above the caption
     rows, columns = (drawn.any(axis).nonzero()[0] for axis in (1, 0))
-    assert np.ptp(rows) > 100
+    assert np.ptp(rows) > 58
     assert 0 < rows.min() < rows.max() < len(drawn) - 1
-    assert 200 < columns.min() < columns.max() < 600
+    assert 125 < columns.min() < columns.max() < 375
 
 
 STORY = """
 const boxes = [...document.querySelectorAll(".voxels")], told = [];
 const state = () => boxes.map((box) => box.dataset.shown === "voxels" ? "v" : "p").join("");
 const until = async (what, condition) => {
-  for (let n = 0; n < 300 && !condition(); n++) await new Promise((done) => setTimeout(done, 100));
+  for (let n = 0; n < 1500 && !condition(); n++) await new Promise((done) => setTimeout(done, 20));
   told.push(what + " " + state());
 };
 const drawn = () => state().split("v").length - 1;
@@ -123,64 +123,9 @@ const tap = (box) => box.dispatchEvent(new PointerEvent("pointerdown"));
   boxes[5].remove();
   tap(boxes[12]);
   await until("removed", () => state()[12] === "v");
-  fetch("/told", { method: "POST", body: told.join(", ") });
+  tell(told);
 })();
 """
-
-
-class Listener(BaseHTTPRequestHandler):
-    """A server of one page, to which the page posts its results."""
-
-    page, loads, told = b"", 0, None
-
-    def do_GET(self):
-        type(self).loads += self.path == "/"
-        self.send_response(200)
-        self.end_headers()
-        self.wfile.write(self.page if self.path == "/" else b"")
-
-    def do_POST(self):
-        type(self).told = self.rfile.read(int(self.headers["Content-Length"])).decode()
-        self.send_response(200)
-        self.end_headers()
-
-    def log_message(self, *_):
-        pass
-
-
-@pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_of_many_viewers_twelve_render_and_tapped_or_lost_ones_are_restored(small, tmp_path):
-    page = save_page("\n".join([*[small] * 18, f"<script>{STORY}</script>"]), tmp_path / "page.html", "many")
-    told, loads = heard(page, tmp_path, 3)
-    states = dict(each.split(" ") for each in told if "focus" not in each)
-    assert states["loaded"] == states["again"] == "v" * 12 + "p" * 6
-    assert states["lost"] == "p" + "v" * 11 + "p" * 6
-    assert states["tapped"].count("v") == 12
-    assert states["tapped"][13] == "v"
-    assert states["removed"][12] == "v"
-    assert "focused" in told
-    assert loads == 1
-
-
-def heard(page, folder, most):
-    """The results that a page posts from a browser, and how often it was loaded, at most `most` times."""
-    listener = type("Heard", (Listener,), {"page": page.read_bytes()})
-    flags = [each for each in FLAGS if not each.startswith("--virtual-time")]
-    with ThreadingHTTPServer(("127.0.0.1", 0), listener) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        command = [str(chromium), *flags, f"--user-data-dir={folder / 'profile'}", "--remote-debugging-port=0"]
-        address = f"http://127.0.0.1:{server.server_port}/"
-        browser = subprocess.Popen([*command, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            deadline = time.monotonic() + 120
-            while listener.told is None and listener.loads < most and time.monotonic() < deadline:
-                time.sleep(0.05)
-        finally:
-            browser.terminate()
-            browser.wait(20)
-            server.shutdown()
-    assert listener.told is not None, "the page told nothing"
-    return listener.told.split(", "), listener.loads
 
 
 INPUT = """
@@ -193,7 +138,7 @@ WebGL2RenderingContext.prototype.uniform3f = function (place, ...values) {
 const frames = async () => { for (let n = 0; n < 3; n++) await new Promise(requestAnimationFrame); };
 const told = [], box = document.querySelector(".voxels");
 (async () => {
-  while (box.dataset.shown !== "voxels") await new Promise((done) => setTimeout(done, 100));
+  while (box.dataset.shown !== "voxels") await new Promise((done) => setTimeout(done, 20));
   const canvas = box.querySelector("canvas");
   canvas.setPointerCapture = () => {}; // of pointers that are none
   const send = (kind, clientX, more) =>
@@ -228,15 +173,108 @@ const told = [], box = document.querySelector(".voxels");
     canvas.dispatchEvent(event);
     told.push(`${modifier}${key} ${event.defaultPrevented ? "moves" : "stays"}`);
   }
-  fetch("/told", { method: "POST", body: told.join(", ") });
+  tell(told);
+})();
+"""
+
+ADDRESSES = """
+const box = document.querySelector(".voxels"), pose = "1,0,0,0,0,1,0,0,0,0,1,2,";
+const addresses = ["9,9,4,4,0,8", "9,9,4,4,-5,8", "9,9,4,4,10.5,8", "9,9,4,4,8,100000", "0,9,4,4,8,8", "9,9,4,4,12,8"];
+const told = JSON.parse(sessionStorage.told || "[]");
+(async () => {
+  while (box.dataset.shown !== "voxels") await new Promise((done) => setTimeout(done, 20));
+  const { style, width, height } = box.querySelector("canvas");
+  told.push(style.position === "fixed" ? `${width}x${height}` : "turns");
+  sessionStorage.told = JSON.stringify(told);
+  const next = addresses[told.length - 1];
+  if (next) location.hash = "#camera=" + pose + next;
+  setTimeout(() => tell(told), next ? 5000 : 100); // unless it is loaded anew
 })();
 """
 
 
+TELL = """
+const tell = async (told) => {
+  const next = await fetch(location.pathname, { method: "POST", body: told.join(", ") });
+  location.href = await next.text();
+};
+"""
+
+
+class Listener(BaseHTTPRequestHandler):
+    """A server of pages, each of which posts its results and opens the next one."""
+
+    pages, loads, told = {}, {}, {}
+
+    def do_GET(self):
+        if self.path in self.pages:
+            self.loads[self.path] = self.loads.get(self.path, 0) + 1
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(self.pages.get(self.path, b""))
+
+    def do_POST(self):
+        self.told[self.path] = self.rfile.read(int(self.headers["Content-Length"])).decode().split(", ")
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(next((path for path in self.pages if path not in self.told), "about:blank").encode())
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def heard(small, tmp_path_factory):
+    """A function of a path: the results that its page posted from a browser, and how often it was loaded."""
+    folder, pages = tmp_path_factory.mktemp("pages"), {}
+    for path, count, script in (("/many", 18, STORY), ("/input", 1, INPUT), ("/addresses", 1, ADDRESSES)):
+        fragments = [*[small] * count, f"<script>{TELL}{script}</script>"]
+        pages[path] = save_page("\n".join(fragments), folder / "page.html", path).read_bytes()
+    listener = type("Heard", (Listener,), {"pages": pages, "loads": {}, "told": {}})
+    flags = [each for each in FLAGS if not each.startswith("--virtual-time")]
+    with ThreadingHTTPServer(("127.0.0.1", 0), listener) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        command = [str(chromium), *flags, f"--user-data-dir={folder / 'profile'}", "--remote-debugging-port=0"]
+        address = f"http://127.0.0.1:{server.server_port}{next(iter(pages))}"
+        browser = subprocess.Popen([*command, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            deadline = time.monotonic() + 120
+            while len(listener.told) < len(pages) and time.monotonic() < deadline:
+                if max(listener.loads.values(), default=0) > MOST_LOADS:
+                    break
+                time.sleep(0.05)
+        finally:
+            browser.terminate()
+            browser.wait(20)
+            server.shutdown()
+
+    def of(path):
+        assert path in listener.told, f"{path} told nothing"
+        return listener.told[path], listener.loads[path]
+
+    return of
+
+
+MOST_LOADS = 9
+"""Of one page, after which it is not waited for any longer: it would be loaded for ever."""
+
+
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_the_object_turns_with_the_primary_button_and_keys_without_modifiers(small, tmp_path):
-    told, _ = heard(save_page(f"{small}<script>{INPUT}</script>", tmp_path / "page.html", "one"), tmp_path, 3)
-    found = dict(each.split(" ") for each in told)
+def test_of_many_viewers_twelve_render_and_tapped_or_lost_ones_are_restored(heard):
+    told, loads = heard("/many")
+    states = dict(each.split(" ") for each in told if "focus" not in each)
+    assert states["loaded"] == states["again"] == "v" * 12 + "p" * 6
+    assert states["lost"] == "p" + "v" * 11 + "p" * 6
+    assert states["tapped"].count("v") == 12
+    assert states["tapped"][13] == "v"
+    assert states["removed"][12] == "v"
+    assert "focused" in told
+    assert loads == 1
+
+
+@pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
+def test_the_object_turns_with_the_primary_button_and_keys_without_modifiers(heard):
+    found = dict(each.split(" ") for each in heard("/input")[0])
     assert found == {
         "hover": "stays",
         "drag": "moves",
@@ -250,27 +288,9 @@ def test_the_object_turns_with_the_primary_button_and_keys_without_modifiers(sma
     }
 
 
-ADDRESSES = """
-const box = document.querySelector(".voxels"), pose = "1,0,0,0,0,1,0,0,0,0,1,2,";
-const addresses = ["9,9,4,4,0,8", "9,9,4,4,-5,8", "9,9,4,4,10.5,8", "9,9,4,4,8,100000", "0,9,4,4,8,8", "9,9,4,4,12,8"];
-const told = JSON.parse(sessionStorage.told || "[]");
-(async () => {
-  while (box.dataset.shown !== "voxels") await new Promise((done) => setTimeout(done, 100));
-  const { style, width, height } = box.querySelector("canvas");
-  told.push(style.position === "fixed" ? `${width}x${height}` : "turns");
-  sessionStorage.told = JSON.stringify(told);
-  const next = addresses[told.length - 1];
-  if (next) location.hash = "#camera=" + pose + next;
-  const tell = () => fetch("/told", { method: "POST", body: told.join(", ") });
-  setTimeout(tell, next ? 5000 : 500); // unless it is loaded anew
-})();
-"""
-
-
 @pytest.mark.skipif(chromium is None, reason="chromium is not installed; apt-get install chromium")
-def test_a_typed_camera_address_is_used_only_if_it_is_valid(small, tmp_path):
-    told, _ = heard(save_page(f"{small}<script>{ADDRESSES}</script>", tmp_path / "page.html", "one"), tmp_path, 9)
-    assert told == ["turns"] * 6 + ["12x8"]
+def test_a_typed_camera_address_is_used_only_if_it_is_valid(heard):
+    assert heard("/addresses")[0] == ["turns"] * 6 + ["12x8"]
 
 
 def test_a_page_is_one_file_without_external_resources(coarse, views, tmp_path, monkeypatch):

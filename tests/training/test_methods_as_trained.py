@@ -43,7 +43,7 @@ def trained(method, data=None, steps=30, **changes):
 def meta(tmp_path_factory):
     """The checkpoint of a Reptile training."""
     folder = tmp_path_factory.mktemp("mv_meta")
-    trained("mv_meta")[0].save(folder)
+    trained("mv_meta", steps=15)[0].save(folder)
     return folder
 
 
