@@ -1243,7 +1243,8 @@ def test_the_demonstration_shows_the_packaged_model_before_anything_is_trained(t
 
 
 def test_training_continues_after_ctrl_c_with_the_same_result(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(PRESETS, "tiny", demo_preset())
+    preset = demo_preset()
+    monkeypatch.setitem(PRESETS, "tiny", replace(preset, training=replace(preset.training, tasks=1)))
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     command = ["train", "--data", str(demo_folder() / "data"), "--preset", "tiny", "--steps", "4", "--out"]
     step = Trainer.take_step

@@ -37,7 +37,7 @@ def folders(tmp_path_factory):
     autoencoder = AutoencoderConfig(views=2, code=8, latent=8)
     small_model(hypernetwork=None, autoencoder=autoencoder).save(tmp_path / "autoencoder")
     for name in LEARNED:
-        initialisation = InitialisationConfig(name, inner_steps=2, steps=3)
+        initialisation = InitialisationConfig(name, inner_steps=1, steps=2)
         small_model(hypernetwork=None, initialisation=initialisation).save(tmp_path / name)
     found = find_checkpoints([full, tmp_path / "autoencoder", *(tmp_path / name for name in LEARNED)])
     return found | dict.fromkeys(("nerf", "multiplane", "point_multiplane"), plain)
@@ -53,7 +53,7 @@ def test_methods_by_name(folders):
     }
     assert all(isinstance(each, Adapter) for each in made.values())
     assert {name: made[name].steps for name in (*LEARNED, "standard", "mv_shuffled")} == dict.fromkeys(
-        (*LEARNED, "standard", "mv_shuffled"), 3
+        (*LEARNED, "standard", "mv_shuffled"), 2
     )
     assert isinstance(made["nearest_view"], NearestView)
     assert isinstance(made["hyperplanes_swapped"], Swapped)
@@ -167,7 +167,7 @@ def test_no_method_reads_a_pixel_of_the_query_views(folders, monkeypatch):
 
     data.task = poisoned
     objects = [data.task(name).support for name in data.names("test")]
-    for name in (f"{name}_2" if name.endswith("scratch") else name for name in METHODS):
+    for name in (f"{name}_1" if name.endswith("scratch") else name for name in METHODS):
         adapter = make_method(Request(name, folders, objects=objects, settings=FineTuning(rays=16)))
         evaluate(name, adapter, data, ["test0"], lambda score, task, pictures, field: read.append(pictures.images))
         again = make_method(Request(name, folders, objects=objects, settings=FineTuning(rays=16)))
