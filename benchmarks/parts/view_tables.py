@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks.parts.reporting import Row
-from hyperplanes.configuration.fine_tuning import MANY_VIEWS
+from hyperplanes.adaptation.correction.residuals import MIN_CORRECTED_VIEWS
 from hyperplanes.utilities.files.tables import markdown_table
 
 __all__ = ["NAMES", "Result", "views", "views_over", "views_residuals", "views_summary", "views_tuned"]
@@ -100,11 +100,11 @@ def views_summary(*results: Result) -> str:
 
 
 def views_residuals(*results: Result) -> str:
-    """The table of one forward pass of `small` without and with residual correction, for MANY_VIEWS views or more."""
+    """The table of one forward pass of `small` without and with residual correction, for three views or more."""
     found, counts = _of_views(results)
     lines = []
     for name, rows in found.items():
-        for count in (each for each in counts if each >= MANY_VIEWS and ("uncorrected", each) in rows):
+        for count in (each for each in counts if each >= MIN_CORRECTED_VIEWS and ("uncorrected", each) in rows):
             scores = [rows[method, count]["psnr"] for method in ("hull_blend", "uncorrected", "one_step")]
             over = _above(rows["one_step", count], "over_uncorrected")
             objects = rows["one_step", count]["objects"]

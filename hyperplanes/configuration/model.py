@@ -58,7 +58,7 @@ class ModelConfig:
         learned_steps: steps of gradient descent by a network after the forward pass
             (`adaptation.optimisation.learned_steps`), half as many from twenty views on; `training.learned_step`
             trains it after the model.
-        residuals: whether pictures from ten views or more, unless these are large, are corrected by the residuals of
+        residuals: whether pictures from three views or more, unless these are large, are corrected by the residuals of
             the views (`adaptation.correction.residuals`).
         symmetric: whether reflections of the views of an object that looks symmetric are added to its views
             (`adaptation.symmetry.detection`). Not used in training.

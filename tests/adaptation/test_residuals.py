@@ -17,7 +17,6 @@ from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.adaptation.symmetry.reflections import with_reflections
 from hyperplanes.commands.inputs.disk_cache import keep_field, recall_field
-from hyperplanes.configuration.fine_tuning import MANY_VIEWS
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast
@@ -268,8 +267,8 @@ def model(**settings):
 
 @pytest.fixture(scope="module")
 def many():
-    """As many views as residual correction needs."""
-    return ball_views(ring(MANY_VIEWS, SIZE))
+    """More views than residual correction needs."""
+    return ball_views(ring(6, SIZE))
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 0.7])
@@ -325,15 +324,15 @@ def test_a_model_without_residuals_is_another_one_with_the_same_weights(many):
 
 def test_pictures_of_few_or_large_views_or_without_masks_are_not_corrected(many, monkeypatch):
     assert isinstance(model().adapt(many), CorrectedField)
-    for others in (many[: MANY_VIEWS - 1], replace(many, masks=None)):
+    for others in (many[: residuals.MIN_CORRECTED_VIEWS - 1], replace(many, masks=None)):
         assert not isinstance(model().adapt(others), CorrectedField)
     assert not isinstance(test_stacking.model().adapt(many), CorrectedField)
-    monkeypatch.setattr(residuals, "MAX_SUPPORT_PIXELS", MANY_VIEWS * SIZE[0] * SIZE[1] - 1)
+    monkeypatch.setattr(residuals, "MAX_SUPPORT_PIXELS", len(many) * SIZE[0] * SIZE[1] - 1)
     assert not isinstance(model().adapt(many), CorrectedField)
 
 
 def test_fine_tuned_random_and_swapped_fields_are_corrected_too(many):
-    adapter, other = model(), ball_views(ring(MANY_VIEWS, SIZE), colour=(0.1, 0.3, 0.9))
+    adapter, other = model(), ball_views(ring(6, SIZE), colour=(0.1, 0.3, 0.9))
     assert isinstance(FineTuned(adapter, 1).adapt(many), CorrectedField)
     assert isinstance(FromScratch(adapter, 1).adapt(many), CorrectedField)
     assert isinstance(Swapped(adapter, [many, other]).adapt(many), CorrectedField)
