@@ -31,12 +31,11 @@ from small_packaged import small_packaged
 from data_gen.rendering.renderers import RendererError
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView, ResidualField
 from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
-from hyperplanes.adaptation.correction.residuals import MIN_CORRECTED_VIEWS
 from hyperplanes.cli import main
 from hyperplanes.commands import adapt, find_verb, find_verbs, parsing, render, split_settings
 from hyperplanes.commands.inputs.scene import read_scene
 from hyperplanes.commands.output.console import Console
-from hyperplanes.configuration.fine_tuning import FineTuning
+from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
 from hyperplanes.configuration.presets import PRESETS
 from hyperplanes.data import DataError, open_dataset, read_task
 from hyperplanes.data.packaged import locate_scene
@@ -728,7 +727,7 @@ def test_render_adds_residuals_when_asked_to(tmp_path, capsys):
 
 
 def test_pictures_of_many_views_are_corrected_unless_that_is_off(tmp_path, monkeypatch, capsys):
-    scene = first_views(locate_scene("example-car"), tmp_path / "scene", support=MIN_CORRECTED_VIEWS, query=2)
+    scene = first_views(locate_scene("example-car"), tmp_path / "scene", support=MANY_VIEWS, query=2)
     command = ["--checkpoint", "small", "--views", str(scene), "--downscale", "4"]
     monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path / "cache"))
     with small_packaged(learned_steps=0):
