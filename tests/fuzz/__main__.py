@@ -13,6 +13,8 @@ from collections import Counter
 from functools import partial
 from pathlib import Path
 
+import torch
+
 from tests.fuzz.calls import run_calls
 from tests.fuzz.campaign import run_campaign
 from tests.fuzz.commands import run_commands
@@ -30,6 +32,7 @@ def main():
     parser.add_argument("--kinds", nargs="+", choices=CORPUS, help="kinds of files; by default all")
     options = parser.parse_args()
     faulthandler.enable()
+    torch.set_num_threads(1)  # commands run in forks of this process, in which OpenMP would wait for threads
     home = Path(tempfile.mkdtemp(prefix="hyperplanes-fuzz-"))
     campaigns = {
         "files": partial(run_campaign, kinds=options.kinds),

@@ -117,7 +117,7 @@ def draw_line(draw):
     if way < 0.04 and verb not in LONG:
         line.remove(draw.choice(line))
     elif way < 0.06:
-        line.insert(draw.randrange(len(line) + 1), draw.choice([*NAMES, *PLACES, "--", "--help", "--traceback", "-x"]))
+        line.insert(draw.randrange(len(line) + 1), draw.choice([*NAMES, *PLACES, "--", "--help", "-x"]))
     return [verb, *line]
 
 
