@@ -434,7 +434,7 @@ def test_the_loss_of_few_rays_by_contrast_varies_less():
 
 
 def test_residuals_raise_psnr_and_residuals_of_shuffled_views_lower_it(monkeypatch):
-    """Measured: 0.9 dB gained, 0.8 dB if each view reads itself; residuals of views in another order lose 19 dB."""
+    """Measured: 1.05 dB gained, 0.90 if each view reads itself; residuals of views in another order lose 19 dB."""
     support, field = shape().support, composition(25)
     order = torch.randperm(len(support), generator=torch.Generator().manual_seed(0)).tolist()
     shuffled = replace(support, images=support.images[order])

@@ -106,13 +106,12 @@ class AdaptedField:
         """The same field without residual correction of its pictures (`adaptation.correction.residuals`)."""
         return self
 
-    def with_view_penalty(self, view: int, given: int, penalty: float) -> AdaptedField:
-        """The same field, which prefers other support views to one of them; densities and voxels stay.
+    def with_penalty_at(self, centre: Float[Tensor, 3], penalty: float) -> AdaptedField:
+        """The same field, which prefers other support views to those from one place; densities and voxels stay.
 
         Args:
-            view: the index of that view. Its reflections, which follow the given views, get the penalty as well.
-            given: number of support views, without reflections.
-            penalty: as in `VisibilityPlanes.with_added_penalty`.
+            centre: of their cameras.
+            penalty: as in `VisibilityPlanes.with_penalty_at`.
 
         Returns:
             A field with that penalty; one that does not choose between views is returned unchanged.
@@ -120,8 +119,8 @@ class AdaptedField:
         own, planes = self.field, getattr(self.field, "planes", None)
         if not (isinstance(planes, VisibilityPlanes) and is_dataclass(own) and not isinstance(own, type)):
             return self
-        penalised = planes.with_added_penalty(torch.arange(view, len(planes), given), penalty)
-        return replace(self, field=replace(own, planes=penalised), refined=self.refined_occupancy)
+        penalised = replace(own, planes=planes.with_penalty_at(centre, penalty))
+        return replace(self, field=penalised, refined=self.refined_occupancy)
 
     @property
     def dtype(self) -> torch.dtype:

@@ -121,10 +121,10 @@ class HyperPlanes(HyperPlanesNetwork):
         The steps begin at theta + delta, interpolated with random weights by `settings.fresh`. They optimise either
         these weights or, as in the paper, a copy of the hypernetwork while theta is frozen (HyperPlanes, section 3,
         fine-tuning). Zero steps give the field of `adapt`. From 20 views on, the grid of features gets more cells
-        (`settings.cells`). From three views on, pictures are corrected as those of `adapt` are. If the model does not
-        correct them (`without_residuals`, or large views) but has a gating network, they are averaged with those of the
-        visual hull (`stacking.tuned_field`). With fewer views they are averaged with those of the field before the
-        steps (`settings.average`).
+        (`settings.cells`). From three views on, pictures are corrected as those of `adapt` are. With fewer than ten
+        views they are averaged with those of the field before the steps (`settings.average`). With more, if the model
+        does not correct them (`without_residuals`, or large views) but has a gating network, they are averaged with
+        those of the visual hull (`stacking.tuned_field`).
 
         Args:
             support: the views of the object.

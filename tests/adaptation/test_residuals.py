@@ -15,12 +15,10 @@ from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.correction import residuals
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.swapped import Swapped
-from hyperplanes.adaptation.symmetry.reflections import with_reflections
 from hyperplanes.commands.inputs.disk_cache import keep_field, recall_field
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast
-from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.rendering import RayMarching
 from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
@@ -294,7 +292,7 @@ def test_a_view_with_a_penalty_is_hardly_read_for_its_own_picture(many, name):
     views = replace(many, images=torch.where(many.masks > 0.5, noise, many.images))
     made = {"stacked": test_stacking.model(), "rotated": model(azimuth=0.7).without_residuals()}
     field = HullBlend().adapt(views) if name == "hull_blend" else made[name].adapt(views)
-    penalised = field.with_view_penalty(3, len(views), 1.0)
+    penalised = field.with_penalty_at(camera.centres(views.cameras)[3], 1.0)
     one = camera.select(views.cameras, [3])
     for own, other in ((field, penalised), *([(field.other, penalised.other)] if name == "stacked" else [])):
         errors = [(each.render(one).images - views.images[[3]]).square().mean() for each in (own, other)]
@@ -303,13 +301,19 @@ def test_a_view_with_a_penalty_is_hardly_read_for_its_own_picture(many, name):
     assert torch.equal(penalised.density(points), field.density(points))
 
 
-def test_reflections_of_a_view_get_its_penalty_and_fields_that_choose_no_views_stay():
-    views = with_reflections(ball_views(ring(3, SIZE)), Symmetry(Plane((1.0, 0.0, 0.0))))
-    field = HullBlend().adapt(views).with_view_penalty(1, 3, 0.5)
-    seen = field.field.planes.choose(torch.zeros(1, 3), best=6).best
-    assert sorted(seen.views[0, -2:].tolist()) == [1, 4]
+def test_only_views_from_the_place_get_the_penalty_and_fields_that_choose_no_views_stay(many):
+    field, (one, other) = HullBlend().adapt(many), camera.centres(many.cameras)[:2]
+
+    def penalties(adapted):
+        seen = adapted.field.planes.choose(torch.zeros(1, 3), best=len(many)).best
+        return seen.penalty[0, seen.views[0].argsort()]
+
+    added = penalties(field.with_penalty_at(one, 0.5)) - penalties(field)
+    torch.testing.assert_close(added, 0.5 * torch.eye(len(many))[0])
+    between = field.with_penalty_at((one + other) / 2, 0.5)
+    assert torch.equal(penalties(between), penalties(field))
     grey = ball((0.5, 0.5, 0.5))
-    assert grey.with_view_penalty(0, 3, 0.5) is grey
+    assert grey.with_penalty_at(one, 0.5) is grey
 
 
 def test_a_model_without_residuals_is_another_one_with_the_same_weights(many):

@@ -93,9 +93,9 @@ class RotatedField(AdaptedField):
         """As `AdaptedField.with_sampling`."""
         return replace(self, sampling=sampling, unrotated=self.unrotated.with_sampling(sampling))
 
-    def with_view_penalty(self, view: int, given: int, penalty: float) -> RotatedField:
-        """As `AdaptedField.with_view_penalty`."""
-        return replace(self, unrotated=self.unrotated.with_view_penalty(view, given, penalty))
+    def with_penalty_at(self, centre: Float[Tensor, 3], penalty: float) -> RotatedField:
+        """As `AdaptedField.with_penalty_at`."""
+        return replace(self, unrotated=self.unrotated.with_penalty_at(_moved(centre, self._back), penalty))
 
     @property
     def _back(self) -> Float[Tensor, "4 4"]:

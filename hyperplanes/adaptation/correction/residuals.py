@@ -157,7 +157,8 @@ class ResidualField:
         """The field, which reads a support view as if it stood OWN_VIEW_ANGLE farther away."""
         if not isinstance(self.uncorrected, AdaptedField):
             return self.uncorrected
-        return self.uncorrected.with_view_penalty(view, len(self.views), OWN_VIEW_ANGLE / PENALTY_RADIANS)
+        centre = camera.centres(self._planes.cameras)[view]
+        return self.uncorrected.with_penalty_at(centre, OWN_VIEW_ANGLE / PENALTY_RADIANS)
 
     def _compute(self, chosen: list[int]) -> None:
         """Computes residual, depth times opacity, and opacity of the chosen support views, unless done already.
@@ -198,7 +199,7 @@ class CorrectedField(AdaptedField):
         """As `AdaptedField.without_residuals`."""
         return self.uncorrected
 
-    def with_view_penalty(self, view: int, given: int, penalty: float) -> CorrectedField:
+    def with_penalty_at(self, centre: Float[Tensor, 3], penalty: float) -> CorrectedField:
         """This field: residuals that are corrected again are those of its pictures."""
         return self
 

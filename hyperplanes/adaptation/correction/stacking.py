@@ -79,10 +79,9 @@ class StackedField(AdaptedField):
             self, sampling=own or self.sampling, other=self.other.with_sampling(other) if other else self.other
         )
 
-    def with_view_penalty(self, view: int, given: int, penalty: float) -> AdaptedField:
-        """As `AdaptedField.with_view_penalty`, of both fields."""
-        own = super().with_view_penalty(view, given, penalty)
-        return replace(own, other=self.other.with_view_penalty(view, given, penalty))
+    def with_penalty_at(self, centre: Float[Tensor, 3], penalty: float) -> AdaptedField:
+        """As `AdaptedField.with_penalty_at`, of both fields."""
+        return replace(super().with_penalty_at(centre, penalty), other=self.other.with_penalty_at(centre, penalty))
 
     @without_autocast
     def trace(self, rays: Rays, generator: torch.Generator | None = None, *, differentiable: bool = True) -> Rendered:

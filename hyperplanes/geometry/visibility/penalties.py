@@ -10,7 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hyperplanes.geometry.chosen_views import BORDER_MARGIN, BORDER_PENALTY, BORDER_POLE, OPAQUE_MASK, Penalties
+from hyperplanes.geometry.chosen_views import (
+    BORDER_MARGIN,
+    BORDER_PENALTY,
+    BORDER_POLE,
+    INVISIBLE_PENALTY,
+    OPAQUE_MASK,
+    PENALTY_RADIANS,
+    Penalties,
+)
 
 __all__ = ["ViewPenalties", "fading", "margin", "margins"]
 
@@ -35,6 +43,16 @@ class ViewPenalties:
     def _cut(self) -> bool:
         """Whether a border crops the object in any view."""
         return bool(self.margins.any())
+
+    def limits(self, size: Sequence[int]) -> list[float]:
+        """What the kernels read of the penalties, apart from offsets and margins.
+
+        Args:
+            size: height and width of the pictures.
+        """
+        own = self.penalties
+        of_views = [own.deepest, own.partly, OPAQUE_MASK, INVISIBLE_PENALTY, PENALTY_RADIANS]
+        return [*of_views, own.steep, own.highest, own.least, 1 / margin(*size), BORDER_PENALTY, BORDER_POLE]
 
     def penalty(
         self,

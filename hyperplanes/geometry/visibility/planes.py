@@ -16,10 +16,7 @@ from torch import Tensor
 
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.chosen_views import (
-    BORDER_PENALTY,
-    BORDER_POLE,
     INVISIBLE_PENALTY,
-    OPAQUE_MASK,
     PENALTY_RADIANS,
     SMALLEST_ANGLE,
     WEIGHT_FALLOFF,
@@ -37,7 +34,7 @@ from hyperplanes.geometry.kernels.threads import parallel_for
 from hyperplanes.geometry.occupancy import Occupancy
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.geometry.visibility.first_hits import first_hits
-from hyperplanes.geometry.visibility.penalties import ViewPenalties, margin, margins
+from hyperplanes.geometry.visibility.penalties import ViewPenalties, margins
 from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.transforms import (
     are_plain,
@@ -50,6 +47,7 @@ from hyperplanes.utilities.tensors.transforms import (
 __all__ = ["VisibilityPlanes", "choose_torch"]
 
 VISIBILITY_CHUNK = 512  # per kernel call
+SAME_CENTRE = 1e-3  # distance in radii up to which views are from the same place
 
 
 class VisibilityPlanes:
@@ -132,16 +130,16 @@ class VisibilityPlanes:
         """
         return self._with(offsets=offsets.to(self._view_penalties.offsets))
 
-    def with_added_penalty(self, views: Selection, penalty: float) -> VisibilityPlanes:
-        """The same planes with a penalty added to the offsets of some views.
+    def with_penalty_at(self, centre: Float[Tensor, 3], penalty: float) -> VisibilityPlanes:
+        """The same planes with a penalty added to the offsets of views from one place.
 
         Args:
-            views: their indices, or a boolean for each view.
+            centre: of their cameras, up to SAME_CENTRE.
             penalty: 1 is worth PENALTY_RADIANS radians of angle.
         """
-        offsets = self._view_penalties.offsets.clone()
-        offsets[views] += penalty
-        return self._with(offsets=offsets)
+        offsets = self._view_penalties.offsets
+        apart = (camera.centres(self.colours.cameras).to(offsets) - centre.to(offsets)).norm(dim=1)
+        return self._with(offsets=offsets + penalty * (apart < SAME_CENTRE * self.occupancy.bounds.radius))
 
     def _with(self, **changes: Any) -> VisibilityPlanes:
         """The same planes with other view penalties."""
@@ -202,26 +200,8 @@ class VisibilityPlanes:
 
     def _limits(self) -> list[float]:
         """The parameters of the kernels."""
-        per_radius, own = 1 / self.occupancy.bounds.radius, self._view_penalties.penalties
-        limits = [
-            self.colours.nearest,
-            per_radius,
-            self.tolerance,
-            own.deepest,
-            own.partly,
-            OPAQUE_MASK,
-            INVISIBLE_PENALTY,
-            PENALTY_RADIANS,
-        ]
-        return [
-            *limits,
-            own.steep,
-            own.highest,
-            own.least,
-            1 / margin(*self.maps.shape[1:3]),
-            BORDER_PENALTY,
-            BORDER_POLE,
-        ]
+        own = [self.colours.nearest, 1 / self.occupancy.bounds.radius, self.tolerance]
+        return [*own, *self._view_penalties.limits(self.maps.shape[1:3])]
 
     def shown_cameras(self) -> Tensor:
         """What the kernels read of each view: centre, projection matrix, 0 where masked, penalty offset and margins."""
