@@ -313,6 +313,18 @@ def test_asymmetric_colours_or_shapes_have_no_plane():
     assert symmetry_of(balls(cameras(), [BODY[0], BODY[2]])) is None
 
 
+@pytest.mark.usefixtures("coarse")
+def test_half_transparent_and_very_thin_objects_have_no_plane():
+    """All planes fit equally well where the hull blend is empty."""
+    views = balls(cameras(4, SMALL), [BODY[0], BODY[2]])
+    faint = replace(views, images=1 - 0.4 * (1 - views.images), masks=0.4 * views.masks)
+    white = replace(faint, images=torch.ones_like(faint.images))
+    wire = [((0.01 * place - 0.3, 0.02 * place - 0.5, 0.3), 0.01, RED) for place in range(40)]
+    for given in (faint, white, balls(cameras(4, SMOOTH), wire)):
+        assert symmetry_of(given) is None
+        assert not possible_symmetries(given[:1])
+
+
 def test_no_plane_is_found_from_a_single_view_or_without_masks_or_object():
     views = balls(cameras(), BODY)
     for given in (views[:1], replace(views, masks=None), replace(views, masks=torch.zeros_like(views.masks))):

@@ -66,7 +66,8 @@ def symmetry_of(support: Views) -> Symmetry | None:
 
     Returns:
         The symmetry with which `HullBlend` renders the views best, if its squared error is at most MAX_ERROR_RATIO
-        times that without reflections; None with fewer than MIN_VIEWS views, or without masks.
+        times that without reflections; None with fewer than MIN_VIEWS views, without masks, or if `HullBlend` shows
+        hardly any of the object (`SymmetryJudge.squared_error`).
     """
     if support.masks is None or len(support) < MIN_VIEWS or not support.masks.any():
         return None

@@ -32,6 +32,9 @@ MAX_SECOND_ERROR_RATIO = 1.5  # times the least error, up to which the second be
 COARSE_ROUNDS, FINE_ROUNDS = 3, 2  # of refinement
 OFFSET_STEP = 0.04  # first change of a plane's offset, in radii of the scene
 LOST = 0.05  # fraction of the object's pixels that the hull with reflections may miss
+# share of the object that the blend must show in opaque pixels: it is 0.26 or more for procedural objects, and at most
+# 0.08 for asymmetric figures of thin wire that any plane would fit
+MIN_SHOWN = 0.1
 MAX_ERROR_RATIO = 1.75  # times the squared error without reflections, up to which an object counts as symmetric
 # added to the squared error per pixel of the object; smaller errors come from the voxels of the hull
 ERROR_OFFSET = 3e-3
@@ -84,7 +87,7 @@ class SymmetryJudge:
         views: scaled down.
         voxels: their visual hull.
         rays: through the pixels of the views that may show the hull.
-        alone: squared error without reflections, plus `floor`.
+        alone: squared error without reflections, plus `floor`; infinite if the views show too little to judge by.
         floor: added to all squared errors.
     """
 
@@ -144,8 +147,8 @@ class SymmetryJudge:
         return None if found is None else (found, best)
 
     def error(self, symmetry: Symmetry) -> float:
-        """The squared error relative to that without reflections; infinite if the hull loses too many pixels."""
-        return (self.squared_error(symmetry) + self.floor) / self.alone
+        """The squared error relative to that without reflections; infinite if too little of the object is shown."""
+        return (self.squared_error(symmetry) + self.floor) / self.alone if math.isfinite(self.alone) else math.inf
 
     def squared_error(self, symmetry: Symmetry | None) -> float:
         """The squared error with which `HullBlend` of the views and their reflections renders the views.
@@ -154,22 +157,28 @@ class SymmetryJudge:
             symmetry: of the reflections, if there are any.
 
         Returns:
-            The sum over pixels; infinite if the hull with reflections loses too many of them.
+            The sum over pixels. Infinite if the hull with reflections loses too many of them, or if `HullBlend` shows
+            hardly any of those in which the masks are opaque: it is empty where masks are half transparent, and where
+            parts are thinner than a pixel.
         """
         views, shown, voxels = self.views, self.views, self.voxels
         assert views.masks is not None
-        among = torch.ones_like(views.masks, dtype=torch.bool)
+        seen, among = views.masks >= MIN_OBJECT_OPACITY, torch.ones_like(views.masks, dtype=torch.bool)
         if symmetry is not None:
             shown = images_by(views, symmetry)
             voxels = carved(shown[len(views) :], len(voxels.occupied), voxels)
-            seen, held = views.masks >= MIN_OBJECT_OPACITY, footprint(voxels, views.cameras)[:, None]
+            held = footprint(voxels, views.cameras)[:, None]
             if not voxels.occupied.any() or float((seen & ~held).sum()) > LOST * float(seen.sum()):
                 return math.inf
             among = held | ~seen
         assert shown.masks is not None
         planes = VisibilityPlanes(shown.images, shown.cameras, shown.masks, voxels)
         blend = HullBlend(steps=STEPS_PER_VOXEL * len(voxels.occupied)).adapt_to(planes)
-        found = self.rays.picture(blend.trace(self.rays.rays, differentiable=False).colour, views.masks.shape)
+        traced = blend.trace(self.rays.rays, differentiable=False)
+        visible = (traced.opacity * self.rays.shares)[seen.flatten()[self.rays.pixels]].sum()
+        if float(visible) <= MIN_SHOWN * float(views.masks.sum()):
+            return math.inf
+        found = self.rays.picture(traced.colour, views.masks.shape)
         return float((found - views.images).square().mean(1, keepdim=True)[among].sum())
 
 
