@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from threading import Lock
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +23,7 @@ from hyperplanes.geometry.visibility.planes import VisibilityPlanes
 from hyperplanes.hypernetwork import HyperNetwork, LearnedStep
 from hyperplanes.hypernetwork.making import make_hypernetwork
 from hyperplanes.parameters import Parameters
+from hyperplanes.utilities.machine.locks import ForkSafeLock
 from hyperplanes.utilities.messages.arguments import checked
 from hyperplanes.utilities.tensors.seeding import seeded
 from hyperplanes.views import Views
@@ -253,7 +253,7 @@ class HyperPlanesNetwork(nn.Module):
 _in_use: dict[nn.Module, tuple[int, bool]] = {}
 """How many users each module has, and whether it was in training mode before."""
 
-_counting = Lock()
+_counting = ForkSafeLock()
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import contextmanager
 from itertools import pairwise
-from threading import Lock
 from typing import TypedDict, Unpack, overload
 
 import torch
@@ -23,6 +22,7 @@ from hyperplanes.rendering.sampling.hierarchical import Hierarchical
 from hyperplanes.rendering.sampling.marching import RayMarching
 from hyperplanes.rendering.sampling.samplers import Sampler
 from hyperplanes.rendering.scene import FieldFunction, Scene
+from hyperplanes.utilities.machine.locks import ForkSafeLock
 from hyperplanes.utilities.messages.arguments import checked
 
 __all__ = ["FieldFunction", "Hierarchical", "RayMarching", "Sampler", "allow_tf32", "render"]
@@ -199,4 +199,4 @@ def allow_tf32(device: torch.device) -> Generator[None]:
 _precisions: list[str] = []
 """The setting before the first active context of `allow_tf32`, once for each active context."""
 
-_counting = Lock()
+_counting = ForkSafeLock()

@@ -10,7 +10,6 @@ import os
 import shutil
 import stat
 import tempfile
-import threading
 import warnings
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from typing import Any
 import torch
 
 from hyperplanes.utilities.machine.environment import cache_folder, has_amx, has_bfloat16_products
+from hyperplanes.utilities.machine.locks import ForkSafeLock
 
 __all__ = ["FASTMATH", "compile_function", "compile_kernel", "layers_module"]
 
@@ -148,16 +148,7 @@ def _compiled(function: Callable[..., Any], signature: str | None) -> Callable[.
         setattr(config, "CACHE_DIR", previous)  # noqa: B010
 
 
-_compiling = threading.RLock()  # numba's settings are those of the process
-
-
-def _forget() -> None:
-    global _compiling
-    _compiling = threading.RLock()
-
-
-if hasattr(os, "register_at_fork"):  # a thread that held it is not in the child
-    os.register_at_fork(after_in_child=_forget)
+_compiling = ForkSafeLock()  # numba's settings are those of the process
 
 
 @contextmanager

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
-from threading import RLock
 
 import torch
 
+from hyperplanes.utilities.machine.locks import ForkSafeLock
+
 __all__ = ["seeded"]
 
-_alone = RLock()
+_alone = ForkSafeLock()
 
 
 @contextmanager
