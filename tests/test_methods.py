@@ -132,6 +132,17 @@ def test_a_swapped_object_has_only_the_update_of_the_next_one():
             assert not torch.equal(found, unswapped)
 
 
+def test_training_does_not_change_a_swapped_field():
+    data, model = Balls(test=2), awaken(small_model())
+    supports = [data.task(name).support for name in data.names("test")]
+    values = Swapped(model, supports).adapt(supports[0]).field.parameters
+    before = {name: value.clone() for name, value in values.items()}
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(1.0)
+    assert all(torch.equal(value, before[name]) and not value.requires_grad for name, value in values.items())
+
+
 def test_swapping_works_for_an_object_in_another_precision():
     data, model = Balls(test=2), awaken(small_model()).eval()
     supports = [data.task(name).support for name in data.names("test")]

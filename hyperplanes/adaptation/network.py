@@ -229,12 +229,15 @@ class HyperPlanesNetwork(nn.Module):
             planes = self.target.with_surface(context.planes, voxels.solid())
         return replace(self.field(replace(context, planes=planes), parameters), refined=voxels)
 
-    @torch.no_grad()
     def adapted_weights(self, context: SupportContext) -> Parameters:
-        """Theta + delta in evaluation mode, whatever the mode of the model; later training does not change them."""
-        with in_use(self):
-            update = self.update(context)
-            found = self.theta + update
+        """Theta + delta in evaluation mode, whatever the mode of the model, as `updated_by` returns them."""
+        with torch.no_grad(), in_use(self):
+            return self.updated_by(self.update(context))
+
+    @torch.no_grad()
+    def updated_by(self, update: Parameters) -> Parameters:
+        """Theta + an update, without gradients; later training does not change them."""
+        found = self.theta + update
         return Parameters((name, value if name in update else value.clone()) for name, value in found.items())
 
     def live_pixels_of(self, context: SupportContext, views: Views) -> Tensor | None:

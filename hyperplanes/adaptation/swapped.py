@@ -52,7 +52,7 @@ class Swapped:
         known = list(self._updates)
         own = _digest(self.model, support)
         other = known[(known.index(own) + 1) % len(known) if own in self._updates else 0]
-        weights = take_learned_steps(self.model, prepared, self.model.theta + self._updates[other])
+        weights = take_learned_steps(self.model, prepared, self.model.updated_by(self._updates[other]))
         made = placed.in_scene(stacked_field(self.model, prepared, weights))
         return corrected_field(self.model, made, support)
 
