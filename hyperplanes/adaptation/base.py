@@ -144,6 +144,7 @@ class AdaptedField:
         make = partial(refine, self.occupancy, self.density, margin_loss=MARGIN_LOSS)
         return cached_on(self, "refined", [self.occupancy.occupied, *weights], make)
 
+    @without_autocast
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per world unit, without evaluating colour if the field can do that."""
         points = as_points(points)
@@ -157,6 +158,7 @@ class AdaptedField:
             return self.densities[0](points)
         return self.field(points, torch.nn.functional.normalize(points, dim=-1))[1]
 
+    @without_autocast
     def __call__(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:

@@ -99,6 +99,7 @@ class HyperPlanes(HyperPlanesNetwork):
         """
         return find_symmetry(self, support)
 
+    @without_autocast
     @torch.inference_mode(mode=False)
     @torch.no_grad()
     def adapt_to(self, context: SupportContext) -> AdaptedField:

@@ -15,6 +15,7 @@ from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.adaptation.network import in_use
 from hyperplanes.adaptation.optimisation.learned_steps import take_learned_steps
 from hyperplanes.parameters import Parameters
+from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.views import Views
 
 __all__ = ["Swapped"]
@@ -31,6 +32,7 @@ class Swapped:
         ValueError: a model without a hypernetwork, or fewer than two objects.
     """
 
+    @without_autocast
     def __init__(self, model: HyperPlanes, objects: Iterable[Views]) -> None:
         if model.hypernetwork is None:
             raise ValueError("swapped: expected a model with a hypernetwork, got one without")
@@ -43,6 +45,7 @@ class Swapped:
         if len(self._updates) < 2:
             raise ValueError(f"swapped: expected at least 2 objects to swap updates of, got {len(self._updates)}")
 
+    @without_autocast
     @torch.inference_mode(mode=False)  # learned steps read gradients
     @torch.no_grad()
     def adapt(self, support: Views) -> AdaptedField:

@@ -1,5 +1,7 @@
 """Source of truth: the support images themselves, copied; angles between camera directions by hand."""
 
+import math
+
 import pytest
 import torch
 
@@ -34,6 +36,15 @@ def test_the_nearest_direction_counts_from_the_centre_of_the_scene():
     # from (2, 0, 2.5), direction (2, 0, 1.5): cos 2.5 / (2.5 * 2.236) = 0.447 against 1.5 / 2.5 = 0.6
     pictures = NearestView().adapt(views).render(asked)
     assert pictures.images.flatten(1).mean(1).tolist() == [0.0, 1.0]
+
+
+def test_autocast_does_not_change_which_view_is_the_nearest():
+    # at 0, 0.02 and 0.015 radians: cosines of 0.99989 and 0.99999, which in bfloat16 are both 1
+    first, second, asked = (camera_at((3 * math.sin(angle), 0.0, 3 * math.cos(angle))) for angle in (0.0, 0.02, 0.015))
+    images = torch.stack([torch.zeros(3, 16, 16), torch.ones(3, 16, 16)])
+    copies = NearestView().adapt(Views(images, concatenate([first, second])))
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(copies.render(asked).images, images[1:])
 
 
 def test_the_distance_of_the_camera_does_not_matter():

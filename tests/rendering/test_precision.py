@@ -8,6 +8,7 @@ from torch.nn.functional import linear
 
 from hyperplanes.adaptation.alignment.rotation import Rotation
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
+from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.fields import base
 from hyperplanes.geometry import occupancy
 from hyperplanes.geometry.cameras import (
@@ -100,16 +101,23 @@ def test_geometry_has_full_precision_under_autocast(monkeypatch, compiled):
         assert all(torch.equal(*each) for each in zip(found(), expected, strict=True))
 
 
-def test_autocast_does_not_change_traced_rays():
+def test_autocast_does_not_change_fields():
     views = ball_views(ring(6, (16, 16)))
     model = HyperPlanes.from_pretrained("small")
     model.config = replace(model.config, hull_resolution=16, symmetric=False, azimuth=0.0, learned_steps=0)
     field = model.adapt(views)
     by_pytorch = awaken(small_model()).eval().adapt(views)  # layers too narrow for kernels
     for each in (by_pytorch, field, Rotation(0.3).field(field)):
-        expected = each.trace(views.rays(0), differentiable=False).colour
+        rays = views.rays(0)
+        points = rays.at(torch.full((len(rays),), 3.0))
+
+        def found(field=each, rays=rays, points=points):
+            seen = field.trace(rays, differentiable=False).colour
+            return [seen, field.density(points), *field(points, rays.directions)]
+
+        expected = found()
         with torch.autocast("cpu", torch.bfloat16):
-            assert torch.equal(each.trace(views.rays(0), differentiable=False).colour, expected)
+            assert all(torch.equal(*pair) for pair in zip(found(), expected, strict=True))
 
 
 def test_autocast_does_not_change_adapting_and_rendering():
@@ -129,3 +137,17 @@ def test_autocast_does_not_change_adapting_and_rendering():
             assert torch.equal(within.render(one.cameras).images, field.render(one.cameras).images)
             assert torch.equal(one.rays(0).directions, rays)
         assert torch.equal(within.render(one.cameras).images, field.render(one.cameras).images)
+
+
+def test_autocast_does_not_change_prepared_and_swapped_objects():
+    model = awaken(small_model()).eval()
+    objects = [ball_views(ring(4, (16, 16)), colour=colour) for colour in ((0.8, 0.2, 0.1), (0.1, 0.9, 0.3))]
+    prepared = model.prepare(objects[0])
+
+    def found():
+        fields = model.adapt_to(prepared), Swapped(model, objects).adapt(objects[0])
+        return [each.render(objects[0].cameras).images for each in fields]
+
+    expected = found()
+    with torch.autocast("cpu", torch.bfloat16):
+        assert all(torch.equal(*pair) for pair in zip(found(), expected, strict=True))

@@ -15,6 +15,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.rays import pixel_grid
 from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.views import Views
 
 __all__ = ["NearestView"]
@@ -24,6 +25,7 @@ __all__ = ["NearestView"]
 class _Copies:
     support: Views
 
+    @without_autocast
     def render(self, cameras: PinholeCamera) -> Pictures:
         """The support images whose cameras lie in the most similar directions from the scene's centre.
 
