@@ -9,6 +9,7 @@ import torch
 from hyperplanes.geometry.occupancy import Occupancy, full
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.rendering import RayMarching, march
+from hyperplanes.rendering.sampling import marching
 from hyperplanes.rendering.sampling.marching import _walk_compiled, _walk_torch
 from tests.reference_rendering import camera_at, march_ray, some_rays, voxel_is_occupied
 
@@ -149,6 +150,21 @@ def test_a_ray_from_inside_has_samples_only_ahead():
     assert (found.distances > 0).all()
     assert (found.distances < rays.far[found.ray]).all()
     assert set(found.ray.tolist()) == set(range(9))
+
+
+@pytest.mark.parametrize("walk", [_walk_compiled, _walk_torch])
+def test_the_samples_and_the_memory_of_a_ray_do_not_depend_on_what_is_outside_of_the_cube(walk, monkeypatch):
+    monkeypatch.setattr(marching, "_has_kernel", lambda _: walk is _walk_compiled)
+    grid, rays = random_grid(OFF_CENTRE), some_rays(40)
+    rays = replace(rays, near=torch.zeros_like(rays.near), far=torch.full_like(rays.far, 9.0))  # behind the cube
+    expected = march(rays, grid, 0.07)
+    for far in (100.0, 1e9, 1e300):  # all samples of the longer ones would take 100 GB and more
+        found = march(replace(rays, far=torch.full_like(rays.far, far)), grid, 0.07)
+        assert torch.equal(found.ray, expected.ray)
+        assert torch.equal(found.distances, expected.distances)
+    found = march(replace(rays, near=rays.near - 700.0), grid, 0.07)  # 10,000 steps earlier
+    assert torch.equal(found.ray, expected.ray)
+    torch.testing.assert_close(found.distances, expected.distances, atol=1e-9, rtol=0)
 
 
 def test_samples_lie_within_the_cube_of_the_grid():

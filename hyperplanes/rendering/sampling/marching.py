@@ -128,7 +128,14 @@ def march(rays: Rays, occupancy: Occupancy, step: float, generator: torch.Genera
         offset = torch.rand(len(rays), generator=generator, dtype=rays.near.dtype)
     start = rays.near + offset.to(rays.near) * step
     walk = _walk_compiled if _has_kernel(rays) else _walk_torch
+    # a ray may be far longer than its part in the cube, which is no longer than the diagonal
+    longest = min(longest, 2 * _half_diagonal(occupancy) + 2 * step)
     return PackedSamples(*walk(rays, start, occupancy, step, max(0, int(longest / step)) + 1), step)
+
+
+def _half_diagonal(occupancy: Occupancy) -> float:
+    """Radius of the sphere around the cube of a grid."""
+    return math.sqrt(3) * occupancy.bounds.radius
 
 
 def _has_kernel(rays: Rays) -> bool:
@@ -140,7 +147,7 @@ def _has_kernel(rays: Rays) -> bool:
 def _walk_compiled(
     rays: Rays, start: Tensor, occupancy: Occupancy, step: float, count: int
 ) -> tuple[Int[Tensor, " sample"], Float[Tensor, " sample"]]:
-    """The ray indices and the distances of samples, by the compiled kernel."""
+    """The ray indices and the distances of samples, at most `count` a ray, by the compiled kernel."""
     origins, directions, first, far = (
         each.detach().contiguous().numpy() for each in (rays.origins, rays.directions, start, rays.far)
     )
@@ -166,8 +173,11 @@ def _walk_compiled(
 def _walk_torch(
     rays: Rays, start: Tensor, occupancy: Occupancy, step: float, count: int
 ) -> tuple[Int[Tensor, " sample"], Float[Tensor, " sample"]]:
-    """The ray indices and the distances of samples, in PyTorch."""
+    """The ray indices and the distances of samples, at most `count` a ray, in PyTorch."""
     steps = torch.arange(count, dtype=start.dtype, device=start.device) * step
+    # without the steps before each ray reaches the sphere around the cube
+    middle = ((rays.origins.new_tensor(occupancy.bounds.centre) - rays.origins) * rays.directions).sum(-1)
+    start = start + ((middle - _half_diagonal(occupancy) - start) / step).floor().clamp_min(0) * step
     rows, distances = [start.new_zeros(0, dtype=torch.long)], [start.new_zeros(0)]
     for first in range(0, len(rays), max(1, CANDIDATES // count)):
         part = rays[first : first + max(1, CANDIDATES // count)]

@@ -16,8 +16,8 @@ def march(origins, directions, first, far, step, sphere, box, occupied, ray, dis
     """Writes the samples of rays start..stop in occupied voxels, ray after ray, and their number into found[0].
 
     Samples lie at first + i step, before far. `sphere` is the centre and the radius of the scene, `box` the corners
-    around its occupied voxels. `ray` gets the index of the ray of each sample, `distances` its distance; both have room
-    for all samples.
+    around its occupied voxels. `ray` gets the index of the ray of each sample, `distances` its distance; samples for
+    which they have no room are left out.
     """
     number = first.dtype.type
     side, half, one = occupied.shape[0], number(occupied.shape[0]) / number(2), number(1)
@@ -25,7 +25,7 @@ def march(origins, directions, first, far, step, sphere, box, occupied, ray, dis
     for index in range(start, stop):
         place, end = samples_within(origins, directions, first, far, index, step, box)
         t = first[index] + number(place) * step
-        while t < end:
+        while t < end and count < len(ray):
             # the sample in the cube around the unit sphere
             x = (origins[index, 0] + t * directions[index, 0] - sphere[0]) / sphere[3]
             y = (origins[index, 1] + t * directions[index, 1] - sphere[1]) / sphere[3]
