@@ -1,7 +1,8 @@
 """A differentiable rasteriser of Gaussian splats, compiled for the CPU with numba.
 
-As in "3D Gaussian Splatting" (Kerbl et al., 2023): Gaussians are projected by the local affine approximation of the
-perspective, dilated by 0.3 square pixels, and composited front to back, sorted by depth.
+As in "3D Gaussian Splatting" (Kerbl et al., 2023) and its implementation: Gaussians are projected by the local affine
+approximation of the perspective, for those beyond the border of the picture by the one near it, dilated by 0.3 square
+pixels, and composited front to back, sorted by depth.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ __all__ = ["render_splats", "rotations_of"]
 
 DILATION = 0.3  # square pixels
 LARGEST_ALPHA, SMALLEST_ALPHA = 0.99, 1 / 255
+AROUND = 0.15  # of the picture's width and height, how far beyond its border the projection is approximated
 DEVIATIONS = 3.0  # extent of a splat from its centre, in standard deviations
 
 
@@ -72,7 +74,8 @@ def render_splats(
     centres = torch.stack([(across * x + skew * y) / z + matrix[0, 2], down * y / z + matrix[1, 2]], -1)
     # the axes of each Gaussian in pixels: the Jacobian of the projection times its axes in the camera's frame
     axes = pose[:3, :3] @ rotations_of(quaternions[order]) * scales[order, None]
-    right, below = ((axes[:, row] - (place / z)[:, None] * axes[:, 2]) / z[:, None] for row, place in enumerate((x, y)))
+    slopes = _near_picture(torch.stack([x, y], -1) / z[:, None], matrix, (height, width)).unbind(-1)
+    right, below = ((axes[:, row] - slope[:, None] * axes[:, 2]) / z[:, None] for row, slope in enumerate(slopes))
     right, below = across * right + skew * below, down * below
     xx, yy = right.square().sum(-1) + DILATION, below.square().sum(-1) + DILATION
     xy = (right * below).sum(-1)
@@ -83,6 +86,23 @@ def render_splats(
         centres, conics, opacities[order], colours[order], reach, (height, width)
     )
     return picture.permute(2, 0, 1)
+
+
+def _near_picture(
+    slopes: Float[Tensor, "splat 2"], matrix: Float[Tensor, "3 3"], size: tuple[int, int]
+) -> Float[Tensor, "splat 2"]:
+    """The slopes x / z and y / z of points, clamped to those of the picture and a margin AROUND it.
+
+    The approximation would spread a splat beside the camera, which no ray of the picture meets, over all of it.
+    """
+    height, width = size
+    edges = torch.tensor([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, height - 0.5]])
+    down = (edges[:, 1].to(matrix) - matrix[1, 2]) / matrix[1, 1]
+    across = (edges[:, 0].to(matrix) - matrix[0, 2] - matrix[0, 1] * down) / matrix[0, 0]
+    corners = torch.stack([across, down], -1)
+    low, high = corners.amin(0), corners.amax(0)
+    margin = AROUND * (high - low)
+    return slopes.clamp(low - margin, high + margin)
 
 
 class _Rasterise(torch.autograd.Function):

@@ -137,6 +137,24 @@ def test_the_picture_and_its_gradients_agree_with_autograd(skew):
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.parametrize("z", [0.3, 0.01, 5e-4, 2e-4])
+def test_a_splat_beside_the_camera_is_not_in_the_picture(z):
+    """Its centre is at least 25 standard deviations away from the pyramid of rays."""
+    one = camera.pinhole(camera.symmetric_intrinsics(16, 16, 0.8), torch.eye(4)[None], 16, 16)
+    parts = [
+        torch.tensor([[0.5, 0.0, z]]),
+        torch.full((1, 3), 0.01),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        torch.tensor([0.9]),
+        torch.zeros(1, 3),
+    ]
+    leaves = [part.requires_grad_() for part in parts]
+    picture = render_splats(*leaves, one)
+    assert torch.equal(picture, torch.ones_like(picture))
+    picture.sum().backward()
+    assert all(leaf.grad.isfinite().all() for leaf in leaves)
+
+
 @pytest.mark.parametrize("unit", [1e-7, 1e4])
 def test_splats_do_not_depend_on_the_unit_of_the_world(splats, unit):
     scaled = replace(splats, means=unit * splats.means, scales=unit * splats.scales)
