@@ -27,6 +27,7 @@ from hyperplanes.configuration.model import ModelConfig
 from hyperplanes.geometry.inputs import check_precision
 from hyperplanes.geometry.symmetry.reflections import Symmetry
 from hyperplanes.utilities.messages.arguments import checked
+from hyperplanes.utilities.tensors.gradients import with_gradients
 from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.views import Views
 
@@ -108,6 +109,7 @@ class HyperPlanes(HyperPlanesNetwork):
 
     @checked
     @without_autocast
+    @with_gradients
     def fine_tune(
         self,
         support: Views,
@@ -139,13 +141,8 @@ class HyperPlanes(HyperPlanesNetwork):
             The field. Raises ValueError for steps that are impossible: on a hypernetwork that the model does not have,
             a negative number, "auto" with fewer than 3 views, or on a single view of a field that takes any number of
             them, unless `settings.mask_views` is off. Raises NoProgressError, a ValueError with the final field, if the
-            steps do not lower the error.
-
-        Raises:
-            RuntimeError: inside `torch.inference_mode`.
+            steps do not lower the error. Raises RuntimeError inside `torch.inference_mode`.
         """
-        if torch.is_inference_mode_enabled():
-            raise RuntimeError("fine_tune: expected gradients, got torch.inference_mode; call it outside of that")
         tuned = fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
         return corrected_field(self, tuned, support)
 

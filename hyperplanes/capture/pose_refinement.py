@@ -22,6 +22,8 @@ from hyperplanes.geometry.occupancy import Occupancy, carve
 from hyperplanes.geometry.rays import Rays, Sphere
 from hyperplanes.geometry.volume import interpolate_grid, resampled_grid
 from hyperplanes.rendering.compositing import composite
+from hyperplanes.utilities.tensors.gradients import with_gradients
+from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.utilities.tensors.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
 
@@ -88,6 +90,8 @@ class _MovedCameras(nn.Module):
         return camera.with_poses(self.cameras, pose)
 
 
+@without_autocast
+@with_gradients
 def refine_poses(views: Views, *, on_step: Callable[[int, int], None] | None = None) -> Refined:
     """Views whose cameras fit the images better, if they did not fit well.
 
@@ -99,7 +103,8 @@ def refine_poses(views: Views, *, on_step: Callable[[int, int], None] | None = N
         on_step: called with the number of steps done and the total.
 
     Returns:
-        The views on the CPU in single precision; the mean motion of the cameras is zero.
+        The views on the CPU in single precision; the mean motion of the cameras is zero. Raises RuntimeError inside
+        `torch.inference_mode`.
 
     Raises:
         ValueError: fewer than five views, or cameras with lens distortion.

@@ -131,6 +131,25 @@ def test_views_with_masks_are_not_changed(scene):
     assert cut_out_task(Task(given, given), Console()).support is given
 
 
+def test_the_background_is_the_same_without_gradients_under_autocast_and_for_cameras_in_double_precision(
+    scene, monkeypatch
+):
+    monkeypatch.setattr(background, "LEVELS", ((16, 8, 8, 3),))
+    views, found = scene[0], separate_background(scene[0])
+    small = camera.resized(views.cameras, 8, 8)
+    picture, _ = found.render(small)
+    for mode in (torch.no_grad(), torch.autocast("cpu", torch.bfloat16)):
+        with mode:
+            assert torch.equal(separate_background(views).inner, found.inner)
+            assert torch.equal(found.render(small)[0], picture)
+    assert torch.equal(found.render(camera.to(small, dtype=torch.float64))[0], picture)
+    with (
+        torch.inference_mode(),
+        pytest.raises(RuntimeError, match=r"separate_background: expected gradients, got torch\.inference_mode"),
+    ):
+        separate_background(views)
+
+
 def test_views_in_double_precision_are_cut_out(scene):
     photographs, outlines = scene
     views = photographs.to("cpu", torch.float64)

@@ -85,6 +85,19 @@ def test_a_common_motion_of_all_cameras_is_removed(views):
     torch.testing.assert_close(moving().extrinsics, views.cameras.extrinsics, atol=1e-5, rtol=0)
 
 
+def test_refined_poses_are_the_same_without_gradients_and_under_autocast(views, monkeypatch):
+    monkeypatch.setattr(pose_refinement, "LEVELS", ((16, 8, 3),))
+    expected = refine_poses(views).views.cameras.extrinsics
+    for mode in (torch.no_grad(), torch.autocast("cpu", torch.bfloat16)):
+        with mode:
+            assert torch.equal(refine_poses(views).views.cameras.extrinsics, expected)
+    with (
+        torch.inference_mode(),
+        pytest.raises(RuntimeError, match=r"refine_poses: expected gradients, got torch\.inference_mode"),
+    ):
+        refine_poses(views)
+
+
 def test_few_views_and_lens_distortion_are_refused(views):
     with pytest.raises(ValueError, match="views: expected at least 5 without lens distortion to refine poses, got 4"):
         refine_poses(views[:4])

@@ -19,6 +19,8 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.distortion import DistortedCamera
 from hyperplanes.geometry.rays import Rays, Sphere, cast, pixel_grid
 from hyperplanes.geometry.volume import interpolate_grid, resampled_grid
+from hyperplanes.utilities.tensors.gradients import with_gradients
+from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.utilities.tensors.uncompiled_optimisers import Adam
 from hyperplanes.views import Views
 
@@ -58,10 +60,16 @@ class Separated:
     outer: Grid
     bounds: Sphere
 
+    @without_autocast
     @torch.no_grad()
     def render(self, cameras: camera.PinholeCamera) -> tuple[Float[Tensor, "view 3 height width"], Tensor]:
-        """Pictures of both, and the opacity of the object, (view, 1, height, width)."""
+        """Pictures of both, and the opacity of the object, (view, 1, height, width), in single precision.
+
+        Args:
+            cameras: any number, one image size, in any precision.
+        """
         height, width = camera.image_size(cameras)
+        cameras = camera.to(cameras, self.inner.device, self.inner.dtype)
         pixels, views = pixel_grid(height, width), []
         for view in range(cameras.batch_size):
             parts = []
@@ -84,8 +92,12 @@ class Separated:
         return replace(views, images=views.images * masks + (1 - masks), masks=masks)
 
 
+@without_autocast
+@with_gradients
 def separate_background(views: Views, *, on_step: Callable[[int, int], None] | None = None) -> Separated:
     """Fits the object within the bounds of some views, and its background.
+
+    Inside `torch.inference_mode` it raises RuntimeError.
 
     Args:
         views: photographs without masks, and without lens distortion.
