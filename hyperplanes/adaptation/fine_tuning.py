@@ -14,6 +14,7 @@ from torch import Tensor
 from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.base import AdaptedField, check_masks
 from hyperplanes.adaptation.context import SupportContext, observe, trained_on
+from hyperplanes.adaptation.correction.residuals import corrected_field
 from hyperplanes.adaptation.correction.stacking import stacked_field, tuned_field
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.adaptation.optimisation.descent import Descent, split_holdout
@@ -117,16 +118,20 @@ def _fine_tune_in_frame(
     schedule: int | None,
     on_step: Callable[[int], None] | None,
 ) -> AdaptedField:
-    """As `fine_tune_to`, with the object rotated into its canonical frame."""
+    """As `fine_tune_to`, with the object rotated into its canonical frame, and with residual correction."""
     placed = to_canonical_frame(network, support)
     context = placed.context(network)
     views = trained_on(context, placed.views)
+
+    def finished(field: AdaptedField) -> AdaptedField:
+        return corrected_field(network, placed.in_scene(field), support)
+
     try:
         tuned = fine_tune_to(network, context, steps, settings, views=views, schedule=schedule, on_step=on_step)
     except NoProgressError as error:
-        error.field = None if error.field is None else placed.in_scene(error.field)
+        error.field = None if error.field is None else finished(error.field)
         raise
-    return placed.in_scene(tuned)
+    return finished(tuned)
 
 
 def fine_tune_to(

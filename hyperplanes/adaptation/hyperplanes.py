@@ -143,8 +143,7 @@ class HyperPlanes(HyperPlanesNetwork):
             them, unless `settings.mask_views` is off. Raises NoProgressError, a ValueError with the final field, if the
             steps do not lower the error. Raises RuntimeError inside `torch.inference_mode`.
         """
-        tuned = fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
-        return corrected_field(self, tuned, support)
+        return fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
 
     def with_weights_of(self, adapted: AdaptedField) -> HyperPlanes:
         """The weights of one object as a model without a hypernetwork: its theta is theta + delta (HyperPlanes, Eq. 6).

@@ -14,11 +14,13 @@ from hyperplanes.adaptation import CorrectedField, HullBlend, HyperPlanes, Resid
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.correction import residuals
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
+from hyperplanes.adaptation.optimisation.descent import Descent
 from hyperplanes.adaptation.swapped import Swapped
 from hyperplanes.commands.inputs.disk_cache import keep_field, recall_field
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere, cast
+from hyperplanes.methods import Unchecked
 from hyperplanes.rendering import RayMarching
 from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Views
@@ -340,6 +342,15 @@ def test_fine_tuned_random_and_swapped_fields_are_corrected_too(many):
     assert isinstance(FineTuned(adapter, 1).adapt(many), CorrectedField)
     assert isinstance(FromScratch(adapter, 1).adapt(many), CorrectedField)
     assert isinstance(Swapped(adapter, [many, other]).adapt(many), CorrectedField)
+
+
+def test_the_field_of_unsuccessful_steps_is_corrected_too(many, query, monkeypatch):
+    tuned = FineTuned(model(azimuth=0.7), 1)
+    expected = tuned.adapt(many)
+    monkeypatch.setattr(Descent, "errors", lambda self: (0.0, 0.0))
+    found = Unchecked(tuned).adapt(many)
+    assert isinstance(found, CorrectedField)
+    assert torch.equal(found.render(query.cameras).images, expected.render(query.cameras).images)
 
 
 def test_a_cached_field_is_corrected_in_the_same_way(many, query, tmp_path):
