@@ -74,7 +74,7 @@ class Arguments(ObjectArguments):
             path if that is faster for all its pictures and there are at least 16 support views.
         residuals: Add the differences between the support views and their renderings to the pictures, at places that
             both see. This renders all support views first. auto: as the model is configured; `small` does so with at
-            least 10 views that are not large.
+            least three views that are not large.
         protocol: How the field is sampled: default, as in training; paper, 64 + 128 samples on each ray; or
             ray_marching, which takes samples only in occupied voxels.
     """

@@ -36,8 +36,7 @@ as many (docs/adaptation.md). With FINE_VIEWS or more, half as many learned step
 MANY_VIEWS = 10
 """Support views from which on fine-tuning a field of any number of views begins with partly random weights, draws rays
 by contrast, and averages pictures with the visual hull; with fewer, each of the three loses as often as it gains
-(docs/small-training.md, docs/adaptation.md, docs/image-based.md). From this many views on, pictures are corrected too
-(`adaptation.correction.residuals`)."""
+(docs/small-training.md, docs/adaptation.md, docs/image-based.md)."""
 
 
 @checked_fields
