@@ -29,10 +29,10 @@ class Sphere:
 
     Attributes:
         centre: in world units.
-        radius: in world units, not negative.
+        radius: in world units, above 0.
 
     Raises:
-        ValueError: numbers that are not finite, or a negative radius.
+        ValueError: numbers that are not finite, or a radius that is not above 0.
     """
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -41,10 +41,10 @@ class Sphere:
     def __post_init__(self) -> None:
         if not isinstance(self.centre, tuple) or len(self.centre) != 3:
             raise ValueError(f"centre: expected a tuple of three numbers, got {kind_of(self.centre)}")
-        if not (all(map(math.isfinite, self.centre)) and 0 <= self.radius < math.inf):
-            raise ValueError(
-                f"sphere: expected finite numbers and no negative radius, got {self.centre}, {self.radius}"
-            )
+        if not all(map(math.isfinite, self.centre)):
+            raise ValueError(f"centre: expected finite numbers, got {self.centre}")
+        if not 0 < self.radius < math.inf:
+            raise ValueError(f"radius: expected a finite number above 0, got {self.radius}")
 
     def normalise(self, points: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point 3"]:
         """Points in coordinates in which the sphere is the unit sphere."""

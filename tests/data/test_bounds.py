@@ -20,10 +20,14 @@ def test_the_ball_around_voxels_does_not_depend_on_their_order():
 @pytest.mark.parametrize(
     ("points", "radius"),
     [
-        ([[1.0, 2.0, 3.0]], 0.0),
         ([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], 1.0),
         ([[0.0, 0.0, 0.0], [0.0, 0.0, 4.0], [0.0, 0.0, 1.0]], 2.0),  # the point between the others changes nothing
     ],
 )
 def test_the_ball_around_few_points(points, radius):
-    assert smallest_ball(torch.tensor(points)).radius == pytest.approx(radius, rel=0.03, abs=1e-6)
+    assert smallest_ball(torch.tensor(points)).radius == pytest.approx(radius, rel=0.03)
+
+
+def test_the_ball_around_one_voxel_is_its_margin():
+    ball = smallest_ball(torch.tensor([[1.0, 2.0, 3.0]]), 0.25)
+    assert (ball.centre, ball.radius) == ((1.0, 2.0, 3.0), 0.25)

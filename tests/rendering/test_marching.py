@@ -186,5 +186,5 @@ def test_infinite_rays_and_zero_steps_are_refused_and_backward_rays_have_no_samp
         with pytest.raises(ValueError, match="rays: expected finite near and far"):
             march(straight([2.0], [far]), full(Sphere(), 2), 0.5)
     with pytest.raises(ValueError, match=r"step: expected more than 0 and finite, got 0\.0"):
-        RayMarching(8).place(straight([2.0], [4.0]), full(Sphere(radius=0.0), 2))
+        march(straight([2.0], [4.0]), full(Sphere(), 2), 0.0)
     assert not len(march(straight([4.0, 3.0], [2.0, 3.0]), full(Sphere(), 2), 0.5))

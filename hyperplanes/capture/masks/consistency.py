@@ -197,8 +197,8 @@ def _ball(hull: Occupancy) -> Sphere | None:
     points = points[hull.bounds.normalise(points).norm(dim=-1) <= 1]
     if not len(points):
         return None
-    ball = smallest_ball(points)
-    return Sphere(ball.centre, min(ball.radius + hull.voxel, hull.bounds.radius))
+    ball = smallest_ball(points, hull.voxel)
+    return Sphere(ball.centre, min(ball.radius, hull.bounds.radius))
 
 
 def _differences(mask: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -93,9 +93,8 @@ def estimate_bounds(
         points = points[are_shown(points, small, ends)] if cut else points
         if not len(points):
             return outer if sphere is largest else sphere
-        ball = smallest_ball(points)
-        radius = HULL_MARGIN * (ball.radius + sphere.radius / HULL_SIDE * 3**0.5)
-        sphere = Sphere(ball.centre, min(radius, largest.radius))
+        ball = smallest_ball(points, sphere.radius / HULL_SIDE * 3**0.5)
+        sphere = Sphere(ball.centre, min(HULL_MARGIN * ball.radius, largest.radius))
     return sphere
 
 
@@ -225,11 +224,13 @@ def _look_past_it(centre: Tensor, eyes: Tensor, axes: Tensor, depths: Tensor) ->
     return float(((ahead < low) | (ahead > high)).float().mean()) >= 0.25
 
 
-def smallest_ball(points: Float[Tensor, "point 3"]) -> Sphere:
+def smallest_ball(points: Float[Tensor, "point 3"], margin: float = 0.0) -> Sphere:
     """Nearly the smallest sphere around points (Badoiu and Clarkson, 2003: 100 steps are within a few percent).
 
     Args:
         points: one or more. Grid points that are ordered along z take a third of the time.
+        margin: added to the radius, in world units, as for voxels around the points; above 0 if the points may all be
+            in one place.
     """
     # a point between two others on a line along z is never the farthest
     step = points.diff(dim=0)
@@ -240,7 +241,7 @@ def smallest_ball(points: Float[Tensor, "point 3"]) -> Sphere:
     for step in range(1, 100):
         farthest = points[(points - centre).square().sum(-1).argmax()]
         centre = centre + (farthest - centre) / (step + 1)
-    return Sphere(tuple(centre.tolist()), float((points - centre).norm(dim=-1).max()))
+    return Sphere(tuple(centre.tolist()), float((points - centre).norm(dim=-1).max()) + margin)
 
 
 def _reduced(alpha: Tensor, cameras: PinholeCamera) -> tuple[Tensor, PinholeCamera]:

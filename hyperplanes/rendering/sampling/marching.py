@@ -116,7 +116,7 @@ def march(rays: Rays, occupancy: Occupancy, step: float, generator: torch.Genera
         The samples in occupied voxels.
 
     Raises:
-        ValueError: near and far, or a step, that are not finite, or a step of 0, as for a sphere of radius 0.
+        ValueError: near and far, or a step, that are not finite, or a step of 0.
     """
     longest = float((rays.far - rays.near).max()) if len(rays) else 0.0
     if not math.isfinite(longest):
