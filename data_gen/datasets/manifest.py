@@ -15,7 +15,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hyperplanes.utilities.files.encoding import encode_json, sha256
-from hyperplanes.utilities.files.reading import DATA_SET, MANIFEST, DataError, inside, malformed, read_bytes, read_json
+from hyperplanes.utilities.files.reading import (
+    DATA_SET,
+    MANIFEST,
+    PROGRESS_FOLDER,
+    DataError,
+    inside,
+    malformed,
+    read_bytes,
+    read_json,
+)
 from hyperplanes.utilities.files.settings import flattened
 from hyperplanes.utilities.files.writing import one_writer, write_whole
 
@@ -25,7 +34,6 @@ if TYPE_CHECKING:
 __all__ = ["GenerationState", "Verification", "build_manifest", "holds_data_set", "verify"]
 
 VERSION = 1
-PROGRESS_FOLDER = ".progress"
 
 _DIFFERENCES = 5
 """Most differences between two configurations that a message names."""

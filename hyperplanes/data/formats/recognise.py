@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyperplanes.data.formats.apps import metashape, polycam, realitycapture, record3d
-from hyperplanes.data.formats.catalogue import Catalogue, native
+from hyperplanes.data.formats.catalogue import Catalogue, native, refuse_unfinished
 from hyperplanes.data.formats.collections import co3d, nmr, npz, objaverse, srn
 from hyperplanes.data.formats.scenes import colmap, idr, llff, nsvf
 from hyperplanes.data.formats.scenes.transforms_json import find_transforms, read_transforms, read_transforms_task
@@ -103,7 +103,8 @@ def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
         The catalogue. No image has been read yet.
 
     Raises:
-        DataError: no known layout, or `legacy` with another layout than these two.
+        DataError: no known layout, a data set that `generate` has not finished, or `legacy` with another layout than
+            these two.
     """
     path = Path(path)
     found = _find_catalogue(path, legacy)
@@ -120,6 +121,7 @@ def _find_catalogue(path: Path, legacy: bool) -> Catalogue:
         refuse_unposed(path)
         what = "a file" if path.exists() else "nothing"
         raise DataError(path, "the folder of a data set", what, "check the path, or run hyperplanes generate")
+    refuse_unfinished(path)
     manifest = read_json(path / MANIFEST) if (path / MANIFEST).is_file() else {}
     if manifest.get("format") == DATA_SET and manifest.get("layout", "native") == "native":
         return native(path, manifest)

@@ -119,6 +119,8 @@ def test_verify_finds_missing_and_changed_files(whole, tmp_path):
 def goes_on(out, whole, reused):
     """Check that a second run completes a data set that was interrupted after some objects."""
     assert not (out / "manifest.json").exists(), "the end of the run was not awaited"
+    with pytest.raises(DataError, match=r"found an unfinished one \(\d of 5 objects\); run the same"):
+        Dataset(out)
     (out / ".progress/unfinished/.junk.part").write_bytes(b"half a file")
     with rendered_here():
         report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
