@@ -505,6 +505,13 @@ def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, cap
     assert not list(tmp_path.iterdir()), "a refused command leaves no files"
 
 
+def test_a_training_does_not_write_among_files_of_others(tmp_path, capsys):
+    (tmp_path / "notes.txt").touch()
+    assert main(["train", "--data", str(demo_folder() / "data"), "--out", str(tmp_path)]) == 2
+    assert f"{tmp_path}: expected an empty folder or that of a training, found notes.txt" in error_line(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
 @pytest.mark.parametrize(
     ("verb", "out", "more"),
     [

@@ -43,7 +43,7 @@ from hyperplanes.commands.options import (
     Protocol,
 )
 from hyperplanes.commands.output.console import Bar, Console
-from hyperplanes.commands.output.writing import writes_to
+from hyperplanes.commands.output.writing import refuse_foreign, writes_to
 from hyperplanes.utilities.machine.interrupts import SIGNALS, HungUp, listened_to
 from hyperplanes.utilities.machine.processes import is_first_process
 from hyperplanes.utilities.messages.formatting import format_duration, format_rate
@@ -344,6 +344,8 @@ def _run(arguments: Arguments) -> int:
     if arguments.out.resolve() in {path.resolve() for path in arguments.data}:
         raise ValueError(f"--out: expected a folder of its own, got {arguments.out}, which is --data; name another one")
     first = _is_first(arguments)
+    if first:
+        refuse_foreign(arguments.out)
     console = Console(silent=not first)
     chosen = resolve(arguments)
     method = chosen.model.method
