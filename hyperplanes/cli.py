@@ -84,7 +84,9 @@ def _main(arguments: Sequence[str] | None) -> int:
             module = found.load()
             return module.run(parse(verb, module, rest))
     except KeyboardInterrupt as interrupt:
-        advice = str(interrupt) or "the same command resumes where possible"
+        resumes = getattr(module, "RESUMES", False)
+        usual = "the same command resumes where possible" if resumes else "run the same command again to start over"
+        advice = str(interrupt) or usual
         code = interrupt.code if isinstance(interrupt, Terminated) else 130
         with suppress(OSError):  # the terminal may be closed
             _print_error(f"hyperplanes {verb}: {'interrupted' if code == 130 else 'terminated'}; {advice}")

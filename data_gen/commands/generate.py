@@ -39,6 +39,8 @@ __all__ = ["Arguments", "remarks", "run", "source_of", "summary"]
 BROUGHT = {"Classes": "data_gen.shapes"}
 """Entry point groups whose names are classes."""
 
+RESUMES = True  # the same command continues an interrupted one
+
 
 @dataclass(frozen=True)
 class Arguments:

@@ -61,6 +61,8 @@ __all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 BROUGHT = {"Fields": "hyperplanes.fields"}
 """Groups of entry points whose names are fields and methods, by their heading in the help."""
 
+RESUMES = True  # the same command continues an interrupted one
+
 SAME = {
     "steps": ("training.steps", "training.epochs"),
     "epochs": ("training.epochs", "training.steps"),

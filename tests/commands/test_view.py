@@ -70,7 +70,7 @@ def test_ctrl_c_ends_a_page_without_an_error_and_a_termination_is_reported(numbe
     assert main(["view", "example-car", "--fit", "0"]) == code
     assert viewer.made[0].stopped
     errors = capfd.readouterr().err
-    assert "resumes where possible" not in errors
+    assert "run the same command again" not in errors
     assert "--port: 8080 is in use" in errors  # the page uses another port
     assert ("terminated; the page is closed" in errors) == (code == 143)
 
