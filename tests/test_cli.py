@@ -225,6 +225,13 @@ def test_a_path_with_a_file_or_a_link_to_nothing_says_so(tmp_path, monkeypatch, 
         assert error_line(capsys).endswith(f": {path}: expected a folder of meshes, found {found}; give the folder")
 
 
+def test_a_misspelt_packaged_scene_is_answered_with_a_suggestion(capsys):
+    assert main(["view", "example-cars"]) == 2
+    assert error_line(capsys).endswith(
+        "expected a transforms*.json or the folder of a scene, found nothing; did you mean example-car?"
+    )
+
+
 def test_an_unknown_verb_is_answered_with_a_suggestion(capsys):
     assert main(["trian"]) == 2
     assert "did you mean train?" in error_line(capsys)

@@ -179,7 +179,9 @@ def test_a_file_that_is_not_a_baked_field_is_refused(tmp_path):
     from hyperplanes.utilities.files.checkpoints import save_tensors
 
     save_tensors(tmp_path / "other.safetensors", {"weights": torch.zeros(3)})
-    with pytest.raises(CheckpointError, match=r"other\.safetensors: expected a baked field, .*\(weights\).*bake` writes"):
+    with pytest.raises(
+        CheckpointError, match=r"other\.safetensors: expected a baked field, .*\(weights\).*bake` writes"
+    ):
         BakedField.load(tmp_path / "other.safetensors")
     save_tensors(tmp_path / "model.safetensors", {f"fine.{index}": torch.zeros(3) for index in range(50)})
     (tmp_path / "model.json").touch()

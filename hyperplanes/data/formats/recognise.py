@@ -12,6 +12,7 @@ from hyperplanes.data.formats.collections import co3d, nmr, npz, objaverse, srn
 from hyperplanes.data.formats.scenes import colmap, idr, llff, nsvf
 from hyperplanes.data.formats.scenes.transforms_json import find_transforms, read_transforms, read_transforms_task
 from hyperplanes.data.formats.unposed import refuse_unposed
+from hyperplanes.data.packaged import remedy_for
 from hyperplanes.data.pictures.frames import Listing, assemble
 from hyperplanes.data.pictures.posed import Posed, PosedTask
 from hyperplanes.utilities.entry_points import load_entries
@@ -120,7 +121,8 @@ def _find_catalogue(path: Path, legacy: bool) -> Catalogue:
     if not path.is_dir():
         refuse_unposed(path)
         what = "a file" if path.exists() else "nothing"
-        raise DataError(path, "the folder of a data set", what, "check the path, or run hyperplanes generate")
+        remedy = remedy_for(path, "check the path, or run hyperplanes generate")
+        raise DataError(path, "the folder of a data set", what, remedy)
     refuse_unfinished(path)
     manifest = read_json(path / MANIFEST) if (path / MANIFEST).is_file() else {}
     if manifest.get("format") == DATA_SET and manifest.get("layout", "native") == "native":
@@ -224,6 +226,6 @@ def _format(folder: Path) -> Layout:
     refuse_unposed(folder)
     if not folder.is_dir():
         found = "a file of another kind" if folder.exists() else "nothing"
-        raise DataError(folder, "a transforms*.json or the folder of a scene", found, "check the path")
+        raise DataError(folder, "a transforms*.json or the folder of a scene", found, remedy_for(folder))
     names = ", ".join(sorted(child.name for child in folder.iterdir())[:5]) or "an empty folder"
     raise DataError(folder, "transforms.json or another layout of one scene", names, "give one object's folder")
