@@ -185,7 +185,10 @@ class GenerationState:
             found = ", ".join(sorted(others)[:3])
             raise DataError(self.out, "an empty folder or an unfinished data set", found, "name another one")
         if existing is not None and existing != self.configuration:
-            was, now = flattened(existing), flattened(self.configuration)
+            was, now = (
+                {_option(key): value for key, value in flattened(each).items()}
+                for each in (existing, self.configuration)
+            )
             changed = sorted(key for key in was | now if was.get(key) != now.get(key))
             held, wanted = (
                 ", ".join(f"{key} {source.get(key)}" for key in changed[:_DIFFERENCES]) for source in (was, now)
@@ -252,3 +255,14 @@ class GenerationState:
         if (self.out / MANIFEST).is_file():
             return read_json(self.out / MANIFEST).get("configuration", {})
         return None
+
+
+def _option(key: str) -> str:
+    """The option of `generate` that sets an entry of a configuration; for other entries, their name.
+
+    >>> [_option(key) for key in ("field_of_view", "source.seed", "source.class_name", "generator")]
+    ['--field-of-view', '--seed', '--class', 'generator']
+    """
+    others = {"generator": key, "source.class_name": "--class", "source.folder": "--meshes", "source.meshes": "meshes"}
+    name = key.removeprefix("source.")
+    return others.get(key) or (name if "." in name else f"--{name.replace('_', '-')}")

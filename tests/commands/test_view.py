@@ -131,6 +131,23 @@ def test_the_model_can_be_named_by_its_method_in_compare(tmp_path):
     assert [found[name].config for name in names[:2]] == [model.config] * 2
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "hull_bland",
+            r"--compare: expected a method such as hull_blend, .*, got 'hull_bland'; did you mean hull_blend\?",
+        ),
+        ("maml", "--compare: method maml: expected a checkpoint of maml, got none"),
+    ],
+)
+def test_a_method_that_cannot_be_compared_with_is_refused(name, message, tmp_path):
+    small_model(hypernetwork=None).save(tmp_path)
+    with pytest.raises(ValueError, match=message) as raised:
+        view._others(view.Arguments(Path("example-car"), tmp_path, compare=(name,)), torch.device("cpu"))
+    assert "autoencoder" not in str(raised.value)
+
+
 @pytest.mark.parametrize("option", [["--steps", "1"], ["--refine-poses"], ["--learn-background"], ["--fit", "0"]])
 def test_options_of_adapting_are_refused_with_a_baked_file(option, viewer, monkeypatch, capsys):
     monkeypatch.setattr(view, "load_source", lambda *_, **__: baking.BakedScene(None))

@@ -164,7 +164,7 @@ def test_the_number_of_workers_changes_nothing(whole, tmp_path):
 
 
 def test_another_configuration_in_the_same_folder_is_refused(whole):
-    with pytest.raises(DataError, match=r"cars: expected the data set it holds \(views 4\), found a request for"):
+    with pytest.raises(DataError, match=r"cars: expected the data set it holds \(--views 4\), found a request for"):
         generate(CARS, whole[0], GenerationConfig(held_out=2, views=6, resolution=16))
 
 
