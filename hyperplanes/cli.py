@@ -17,6 +17,7 @@ from hyperplanes.utilities.messages.errors import (
     TRACEBACK_VARIABLE,
     MissingPackageError,
     is_memory,
+    nearest,
     one_line,
     wants_traceback,
 )
@@ -72,6 +73,8 @@ def _main(arguments: Sequence[str] | None) -> int:
 
         return _print(f"hyperplanes {version('hyperplanes')}")
     verb, *rest = given
+    if verb.startswith("-"):
+        return _print_error(f"hyperplanes: no option {verb}; {nearest(verb, ['--help', '--version'])}")
     try:
         found = find_verb(verb)
     except ValueError as error:

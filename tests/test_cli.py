@@ -233,8 +233,9 @@ def test_a_misspelt_packaged_scene_is_answered_with_a_suggestion(capsys):
 
 
 def test_an_unknown_verb_is_answered_with_a_suggestion(capsys):
-    assert main(["trian"]) == 2
-    assert "did you mean train?" in error_line(capsys)
+    for given, meant in (("trian", "train"), ("--verson", "--version")):
+        assert main([given]) == 2
+        assert error_line(capsys).endswith(f"did you mean {meant}?")
 
 
 @pytest.mark.parametrize(
@@ -254,6 +255,7 @@ def test_an_unknown_verb_is_answered_with_a_suggestion(capsys):
         ("evaluate --steps 1 b", "--steps: expected a whole number, got b"),
         ("generate --distance far", "--distance: expected a number, got far"),
         ("generate --held-out far", "--held-out: expected a number, got far"),
+        ("demo --hepl", "no option --hepl; did you mean --help?"),
         ("demo --class bus", "--class: expected one of car, chair, plane, lamp, got bus"),
         ("capture --out x", "missing PHOTOGRAPHS; see hyperplanes capture --help"),
         ("capture a b --out x", "PHOTOGRAPHS: expected one value, got a b"),
@@ -321,6 +323,10 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT", "--out"]
         (["generate", "--class", "car", "--count", "0", "--out", "OUT"], ["at least 1 object", "0"]),
         (["generate", "--class", "car", "--split-file", "OUT", "--out", "OUT"], ["--split-file", "--meshes"]),
         (["train", "--data", "OUT/none", "--out", "OUT/run"], ["OUT/none", "hyperplanes generate"]),
+        (
+            ["train", "--data", "example-car", "--out", "OUT/run"],
+            ["found none in its train split and 1 object in the others"],
+        ),
         (["train", "--data", "DATA", "--preset", "huge", "--out", "OUT/run"], ["quick", "huge"]),
         (["train", "--data", "DATA", "--field", "voxels", "--out", "OUT/run"], ["image_based", "voxels"]),
         (["train", "--data", "DATA", "--steps", "0", "--out", "OUT/run"], ["steps", "0"]),
@@ -970,13 +976,14 @@ def test_inspect_shows_diagnostics_of_the_hypernetwork(capsys):
     assert re.search(r"another object's update costs [\d.]+ dB", shown)
 
 
-def test_an_orbit_is_pictures_and_a_turntable(tmp_path):
+def test_an_orbit_is_pictures_and_a_turntable(tmp_path, capsys):
     demo = demo_folder()
     views = ["--views", str(first_object(demo)), "--out", str(tmp_path), "--all-views"]
     assert main(["render", "--checkpoint", str(demo), *views, "--orbit", "3", "--turntable", "gif"]) == 0
     with Image.open(tmp_path / "turntable.gif") as animation:
         assert animation.n_frames == 3
     assert len(list(tmp_path.glob("*.png"))) == 3
+    assert "estimate, from fewer views than the pictures and without fine-tuning: " in capsys.readouterr().out
 
 
 def test_a_cloud_of_points_is_exported(tmp_path, capsys):
