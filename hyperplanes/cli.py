@@ -110,13 +110,17 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 @contextmanager
 def _one_line_warnings() -> Generator[None]:
-    """Print a UserWarning as one line, without the place in the code that raised it."""
-    usual = warnings.formatwarning
+    """Print a UserWarning as one line, without the place in the code that raised it, and each text once."""
+    usual, printed = warnings.formatwarning, set[str]()
 
     def formatted(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> str:
         if category is not UserWarning:
             return usual(message, category, *place, **more)
-        return f"warning: {' '.join(str(message).split())}\n"
+        line = f"warning: {' '.join(str(message).split())}\n"
+        if line in printed:  # Python forgets what it has shown whenever code changes the filters
+            return ""
+        printed.add(line)
+        return line
 
     warnings.formatwarning = formatted
     try:

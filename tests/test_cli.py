@@ -1312,7 +1312,13 @@ def test_a_missing_package_is_named_in_one_line(monkeypatch, capsys):
 def test_warnings_of_commands_are_one_line_without_a_place_in_the_code():
     script = (
         "import sys, warnings, hyperplanes.cli as cli\n"
-        "cli._main = lambda arguments: warnings.warn('check\\n  cx') or warnings.warn('old', FutureWarning) or 0\n"
+        "def run(arguments):\n"
+        "    for _ in range(2):\n"
+        "        warnings.warn('check\\n  cx')\n"
+        "        warnings.resetwarnings()\n"
+        "    warnings.warn('old', FutureWarning)\n"
+        "    return 0\n"
+        "cli._main = run\n"
         "sys.exit(cli.main([]))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
