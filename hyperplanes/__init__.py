@@ -31,12 +31,15 @@ if TYPE_CHECKING:
     from hyperplanes.geometry import ImagePlanes, Lookup
     from hyperplanes.rendering.renderer import render
     from hyperplanes.training import Trainer
+    from hyperplanes.utilities.files.checkpoints import CheckpointError
+    from hyperplanes.utilities.files.writing import WriteError
     from hyperplanes.utilities.images.metrics import psnr, ssim
     from hyperplanes.views import Task, Views
 
 wait_passively()  # must run before PyTorch is loaded
 
 _HOMES = {
+    "CheckpointError": "utilities.files.checkpoints",
     "DataError": "data",
     "Dataset": "data",
     "FineTuned": "adaptation.fine_tuned",
@@ -49,6 +52,7 @@ _HOMES = {
     "Task": "views",
     "Trainer": "training",
     "Views": "views",
+    "WriteError": "utilities.files.writing",
     "evaluate": "evaluation",
     "extract_mesh": "export.surfaces.mesh",
     "open_dataset": "data",
@@ -64,6 +68,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "CheckpointError",
     "DataError",
     "Dataset",
     "FineTuned",
@@ -76,6 +81,7 @@ __all__ = [
     "Task",
     "Trainer",
     "Views",
+    "WriteError",
     "evaluate",
     "extract_mesh",
     "open_dataset",
@@ -103,4 +109,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted(set(globals()) | set(__all__))
+    """The public names, and those that every module has."""
+    return sorted([*__all__, *(name for name in globals() if name.startswith("__")), "__version__"])

@@ -17,6 +17,7 @@ from hyperplanes.utilities.messages.errors import (
     TRACEBACK_VARIABLE,
     MissingPackageError,
     is_memory,
+    nearest,
     one_line,
     wants_traceback,
 )
@@ -72,6 +73,8 @@ def _main(arguments: Sequence[str] | None) -> int:
 
         return _print(f"hyperplanes {version('hyperplanes')}")
     verb, *rest = given
+    if verb.startswith("-"):
+        return _print_error(f"hyperplanes: no option {verb}; {nearest(verb, ['--help', '--version'])}")
     try:
         found = find_verb(verb)
     except ValueError as error:
@@ -84,7 +87,9 @@ def _main(arguments: Sequence[str] | None) -> int:
             module = found.load()
             return module.run(parse(verb, module, rest))
     except KeyboardInterrupt as interrupt:
-        advice = str(interrupt) or "the same command resumes where possible"
+        resumes = getattr(module, "RESUMES", False)
+        usual = "the same command resumes where possible" if resumes else "run the same command again to start over"
+        advice = str(interrupt) or usual
         code = interrupt.code if isinstance(interrupt, Terminated) else 130
         with suppress(OSError):  # the terminal may be closed
             _print_error(f"hyperplanes {verb}: {'interrupted' if code == 130 else 'terminated'}; {advice}")
@@ -105,13 +110,17 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 @contextmanager
 def _one_line_warnings() -> Generator[None]:
-    """Print a UserWarning as one line, without the place in the code that raised it."""
-    usual = warnings.formatwarning
+    """Print a UserWarning as one line, without the place in the code that raised it, and each text once."""
+    usual, printed = warnings.formatwarning, set[str]()
 
     def formatted(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> str:
         if category is not UserWarning:
             return usual(message, category, *place, **more)
-        return f"warning: {' '.join(str(message).split())}\n"
+        line = f"warning: {' '.join(str(message).split())}\n"
+        if line in printed:  # Python forgets what it has shown whenever code changes the filters
+            return ""
+        printed.add(line)
+        return line
 
     warnings.formatwarning = formatted
     try:

@@ -43,6 +43,7 @@ __all__ = [
     "at_steps",
     "describe_method",
     "find_methods",
+    "is_method",
     "make_method",
 ]
 
@@ -304,6 +305,22 @@ def describe_method(name: str) -> str:
     """
     _, method, steps = _parse(name)
     return method.describe(steps)
+
+
+def is_method(name: str) -> bool:
+    """Whether there is a method of a name.
+
+    >>> is_method("hyperplanes_100"), is_method("hyperplane")
+    (True, False)
+
+    Args:
+        name: as in `describe_method`.
+    """
+    try:
+        _parse(name)
+    except ValueError:
+        return False
+    return True
 
 
 def make_method(request: Request) -> Adapter:

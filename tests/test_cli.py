@@ -225,9 +225,17 @@ def test_a_path_with_a_file_or_a_link_to_nothing_says_so(tmp_path, monkeypatch, 
         assert error_line(capsys).endswith(f": {path}: expected a folder of meshes, found {found}; give the folder")
 
 
+def test_a_misspelt_packaged_scene_is_answered_with_a_suggestion(capsys):
+    assert main(["view", "example-cars"]) == 2
+    assert error_line(capsys).endswith(
+        "expected a transforms*.json or the folder of a scene, found nothing; did you mean example-car?"
+    )
+
+
 def test_an_unknown_verb_is_answered_with_a_suggestion(capsys):
-    assert main(["trian"]) == 2
-    assert "did you mean train?" in error_line(capsys)
+    for given, meant in (("trian", "train"), ("--verson", "--version")):
+        assert main([given]) == 2
+        assert error_line(capsys).endswith(f"did you mean {meant}?")
 
 
 @pytest.mark.parametrize(
@@ -247,6 +255,7 @@ def test_an_unknown_verb_is_answered_with_a_suggestion(capsys):
         ("evaluate --steps 1 b", "--steps: expected a whole number, got b"),
         ("generate --distance far", "--distance: expected a number, got far"),
         ("generate --held-out far", "--held-out: expected a number, got far"),
+        ("demo --hepl", "no option --hepl; did you mean --help?"),
         ("demo --class bus", "--class: expected one of car, chair, plane, lamp, got bus"),
         ("capture --out x", "missing PHOTOGRAPHS; see hyperplanes capture --help"),
         ("capture a b --out x", "PHOTOGRAPHS: expected one value, got a b"),
@@ -314,6 +323,10 @@ BAKE = ["bake", "--checkpoint", "OUT/not-looked-at", "--views", "OUT", "--out"]
         (["generate", "--class", "car", "--count", "0", "--out", "OUT"], ["at least 1 object", "0"]),
         (["generate", "--class", "car", "--split-file", "OUT", "--out", "OUT"], ["--split-file", "--meshes"]),
         (["train", "--data", "OUT/none", "--out", "OUT/run"], ["OUT/none", "hyperplanes generate"]),
+        (
+            ["train", "--data", "example-car", "--out", "OUT/run"],
+            ["found none in its train split and 1 object in the others"],
+        ),
         (["train", "--data", "DATA", "--preset", "huge", "--out", "OUT/run"], ["quick", "huge"]),
         (["train", "--data", "DATA", "--field", "voxels", "--out", "OUT/run"], ["image_based", "voxels"]),
         (["train", "--data", "DATA", "--steps", "0", "--out", "OUT/run"], ["steps", "0"]),
@@ -503,6 +516,13 @@ def test_wrong_input_is_one_line_and_exit_code_2(arguments, parts, tmp_path, cap
     line = error_line(capsys)
     assert all(placed(part) in line for part in parts), line
     assert not list(tmp_path.iterdir()), "a refused command leaves no files"
+
+
+def test_a_training_does_not_write_among_files_of_others(tmp_path, capsys):
+    (tmp_path / "notes.txt").touch()
+    assert main(["train", "--data", str(demo_folder() / "data"), "--out", str(tmp_path)]) == 2
+    assert f"{tmp_path}: expected an empty folder or that of a training, found notes.txt" in error_line(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 @pytest.mark.parametrize(
@@ -956,13 +976,14 @@ def test_inspect_shows_diagnostics_of_the_hypernetwork(capsys):
     assert re.search(r"another object's update costs [\d.]+ dB", shown)
 
 
-def test_an_orbit_is_pictures_and_a_turntable(tmp_path):
+def test_an_orbit_is_pictures_and_a_turntable(tmp_path, capsys):
     demo = demo_folder()
     views = ["--views", str(first_object(demo)), "--out", str(tmp_path), "--all-views"]
     assert main(["render", "--checkpoint", str(demo), *views, "--orbit", "3", "--turntable", "gif"]) == 0
     with Image.open(tmp_path / "turntable.gif") as animation:
         assert animation.n_frames == 3
     assert len(list(tmp_path.glob("*.png"))) == 3
+    assert "estimate, from fewer views than the pictures and without fine-tuning: " in capsys.readouterr().out
 
 
 def test_a_cloud_of_points_is_exported(tmp_path, capsys):
@@ -1291,7 +1312,13 @@ def test_a_missing_package_is_named_in_one_line(monkeypatch, capsys):
 def test_warnings_of_commands_are_one_line_without_a_place_in_the_code():
     script = (
         "import sys, warnings, hyperplanes.cli as cli\n"
-        "cli._main = lambda arguments: warnings.warn('check\\n  cx') or warnings.warn('old', FutureWarning) or 0\n"
+        "def run(arguments):\n"
+        "    for _ in range(2):\n"
+        "        warnings.warn('check\\n  cx')\n"
+        "        warnings.resetwarnings()\n"
+        "    warnings.warn('old', FutureWarning)\n"
+        "    return 0\n"
+        "cli._main = run\n"
         "sys.exit(cli.main([]))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -51,7 +51,7 @@ def test_the_readme_names_verbs_that_exist():
 def test_all_public_names_exist():
     for name in hyperplanes.__all__:
         assert getattr(hyperplanes, name) is not None
-    assert set(hyperplanes.__all__) <= set(dir(hyperplanes))
+    assert {name for name in dir(hyperplanes) if not name.startswith("_")} == set(hyperplanes.__all__)
     assert hyperplanes.__version__
 
 

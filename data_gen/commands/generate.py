@@ -29,7 +29,7 @@ from hyperplanes.commands.options import (
     optional,
 )
 from hyperplanes.commands.output.console import Console
-from hyperplanes.utilities.messages.formatting import format_duration
+from hyperplanes.utilities.messages.formatting import counted, format_duration
 
 if TYPE_CHECKING:
     from data_gen.datasets.generate import GenerationReport, MeshFolder, Procedural
@@ -38,6 +38,8 @@ __all__ = ["Arguments", "remarks", "run", "source_of", "summary"]
 
 BROUGHT = {"Classes": "data_gen.shapes"}
 """Entry point groups whose names are classes."""
+
+RESUMES = True  # the same command continues an interrupted one
 
 
 @dataclass(frozen=True)
@@ -147,25 +149,28 @@ def summary(report: GenerationReport, out: Path) -> str:
         if report.images_per_second
         else ""
     )
-    return f"{out}: {report.written} objects ({splits}{reused}){speed}"
+    return f"{out}: {counted(report.written, 'object')} ({splits}{reused}){speed}"
 
 
 def remarks(report: GenerationReport, out: Path) -> list[str]:
     """One line about each set of objects or files that the user should check, and where they are listed."""
     others = [name for name in report.warned if name not in set(report.incomplete)]
+    explained = "; the text is in the warnings of each object, under objects"
     found = {
         ("not in the split file, so trained on", "not_in_split_file"): report.unlisted,
-        ("drawn without a texture or another file that they name", "with_lost_files"): report.incomplete,
-        ("drawn with other warnings", "with_warnings"): others,
+        ("drawn without a texture or another file that they name", f"with_lost_files{explained}"): report.incomplete,
+        ("drawn with other warnings", f"with_warnings{explained}"): others,
     }
+    too_few = "one more object is needed, because one alone is not held out"
+    remedy = "repair what was skipped, or choose another --held-out" if report.skipped else too_few
     lines = [
         f"{'fewer' if report.splits[split] else 'no'} objects in the split {split}: {report.splits[split]} of {count}; "
-        "repair what was skipped, or choose another --held-out"
+        + remedy
         for split, count in report.requested.items()
         if report.splits[split] < count
     ]
     lines += [
-        f"{what}: {len(names)} of {report.written} objects ({_some(names)}), "
+        f"{what}: {len(names)} of {counted(report.written, 'object')} ({_some(names)}), "
         f"listed in {out / 'manifest.json'} under {key}"
         for (what, key), names in found.items()
         if names

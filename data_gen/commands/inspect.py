@@ -158,7 +158,7 @@ def _inspect(arguments: Arguments, console: Console) -> int:
         return 0
     from data_gen.datasets.inspect import inspect
     from hyperplanes.commands.inputs.scene import refuse_sources
-    from hyperplanes.data.packaged import locate_scene
+    from hyperplanes.data.packaged import locate_scene, remedy_for
     from hyperplanes.utilities.files.reading import DataError
 
     if not locate_scene(arguments.path).exists():
@@ -167,7 +167,7 @@ def _inspect(arguments: Arguments, console: Console) -> int:
             "a data set, posed images, a checkpoint or a baked file, or a model or scene of the package (small, "
             "small-paper, cars-64, example-car)",
             "nothing",
-            "check the path",
+            remedy_for(arguments.path),
         )
     out = arguments.out or Path("runs/inspect") / arguments.path.resolve().name
     refuse_sources(out, arguments.path)

@@ -15,7 +15,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hyperplanes.utilities.files.encoding import encode_json, sha256
-from hyperplanes.utilities.files.reading import DATA_SET, MANIFEST, DataError, inside, malformed, read_bytes, read_json
+from hyperplanes.utilities.files.reading import (
+    DATA_SET,
+    MANIFEST,
+    PROGRESS_FOLDER,
+    DataError,
+    inside,
+    malformed,
+    read_bytes,
+    read_json,
+)
 from hyperplanes.utilities.files.settings import flattened
 from hyperplanes.utilities.files.writing import one_writer, write_whole
 
@@ -25,7 +34,6 @@ if TYPE_CHECKING:
 __all__ = ["GenerationState", "Verification", "build_manifest", "holds_data_set", "verify"]
 
 VERSION = 1
-PROGRESS_FOLDER = ".progress"
 
 _DIFFERENCES = 5
 """Most differences between two configurations that a message names."""
@@ -177,7 +185,10 @@ class GenerationState:
             found = ", ".join(sorted(others)[:3])
             raise DataError(self.out, "an empty folder or an unfinished data set", found, "name another one")
         if existing is not None and existing != self.configuration:
-            was, now = flattened(existing), flattened(self.configuration)
+            was, now = (
+                {_option(key): value for key, value in flattened(each).items()}
+                for each in (existing, self.configuration)
+            )
             changed = sorted(key for key in was | now if was.get(key) != now.get(key))
             held, wanted = (
                 ", ".join(f"{key} {source.get(key)}" for key in changed[:_DIFFERENCES]) for source in (was, now)
@@ -244,3 +255,14 @@ class GenerationState:
         if (self.out / MANIFEST).is_file():
             return read_json(self.out / MANIFEST).get("configuration", {})
         return None
+
+
+def _option(key: str) -> str:
+    """The option of `generate` that sets an entry of a configuration; for other entries, their name.
+
+    >>> [_option(key) for key in ("field_of_view", "source.seed", "source.class_name", "generator")]
+    ['--field-of-view', '--seed', '--class', 'generator']
+    """
+    others = {"generator": key, "source.class_name": "--class", "source.folder": "--meshes", "source.meshes": "meshes"}
+    name = key.removeprefix("source.")
+    return others.get(key) or (name if "." in name else f"--{name.replace('_', '-')}")

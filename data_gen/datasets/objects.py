@@ -11,6 +11,7 @@ from data_gen.datasets.config import GenerationConfig
 from data_gen.datasets.layouts import LAYOUTS, RenderedObject
 from data_gen.datasets.sources import Item
 from hyperplanes.utilities.files.encoding import encode_json, sha256
+from hyperplanes.utilities.files.reading import PROGRESS_FOLDER
 from hyperplanes.utilities.files.writing import write_folder, write_whole
 
 __all__ = ["open_renderer"]
@@ -69,7 +70,7 @@ def _render(renderer: Any, item: Item, config: GenerationConfig, meshes: Path | 
 
 def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict[str, Any]:
     """Write an object's files, then the record that they are complete."""
-    scratch = out / ".progress" / "unfinished"
+    scratch = out / PROGRESS_FOLDER / "unfinished"
     if len(files) > 1:
         folder = os.path.commonpath(files)
         write_folder(out / folder, {os.path.relpath(path, folder): data for path, data in files.items()}, scratch)
@@ -96,5 +97,5 @@ def _write(rendered: RenderedObject, files: dict[str, bytes], out: Path) -> dict
         record["lost_files"] = list(mesh.lost_files)
     checksums = {path: sha256(data) for path, data in files.items()}
     done = {"name": item.name, "record": record, "files": checksums}
-    write_whole(out / ".progress" / "done" / f"{item.name}.json", encode_json(done), scratch, durable=False)
+    write_whole(out / PROGRESS_FOLDER / "done" / f"{item.name}.json", encode_json(done), scratch, durable=False)
     return done

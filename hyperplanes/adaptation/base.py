@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
@@ -33,10 +35,22 @@ from hyperplanes.utilities.tensors.cached_on import cached_on
 from hyperplanes.utilities.tensors.precision import without_autocast
 from hyperplanes.views import Views
 
-__all__ = ["AdaptedField", "Adapter", "Pictures", "Renderable", "attributes_of", "check_masks", "hull"]
+__all__ = [
+    "AdaptedField",
+    "Adapter",
+    "Pictures",
+    "Renderable",
+    "attributes_of",
+    "check_masks",
+    "hull",
+    "masks_problem",
+    "no_masks_warning",
+]
 
 MARGIN_LOSS = 0.9  # `margin_loss` of `refine`: 2.4 % in one voxel
 MAX_HAZY_SHARE = 0.5  # of the pixels of a mask: a larger share with an opacity of less than MIN_MASK_OPACITY is refused
+MAX_MASK_COVERAGE = 0.95  # mean opacity above which masks are as good as no masks
+PROBLEM = "the views have"  # how the text of `masks_problem` begins
 DENSITY_CHUNK = 1 << 12  # per thread, for densities
 
 
@@ -289,6 +303,26 @@ def check_masks(support: Views) -> None:
             f"masks of the support views: expected opacity 0 in the background, found {least:.2g} in most pixels of "
             f"{int(hazy.sum())} of {len(masks)}; set opacity below {MIN_MASK_OPACITY} to 0"
         )
+
+
+def masks_problem(support: Views) -> str:
+    """What is wrong with views without masks, or with masks that leave no background, in one sentence; else nothing."""
+    covered = 1.0 if support.masks is None else float(support.masks.mean())
+    if not covered > MAX_MASK_COVERAGE:
+        return ""
+    what = "no alpha and no masks" if support.masks is None else f"masks that cover {covered:.0%}"
+    return (
+        f"{PROBLEM} {what}, but the model was trained on objects over white, so it would treat the background "
+        "as a part of the object; cut the object out (RGBA images, or a folder masks/)"
+    )
+
+
+@contextmanager
+def no_masks_warning() -> Generator[None]:
+    """A context in which models do not warn of `masks_problem`, for callers that have reported it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", PROBLEM, UserWarning)
+        yield
 
 
 def _from_to(names: Sequence[str]) -> str:

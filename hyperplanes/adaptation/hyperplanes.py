@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
@@ -13,7 +14,7 @@ import torch
 from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.alignment.finding_symmetry import find_symmetry
 from hyperplanes.adaptation.alignment.rotation import RotatedField
-from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.base import AdaptedField, masks_problem
 from hyperplanes.adaptation.checkpoints import read_checkpoint, write_checkpoint
 from hyperplanes.adaptation.context import SupportContext
 from hyperplanes.adaptation.correction.residuals import corrected_field
@@ -79,11 +80,19 @@ class HyperPlanes(HyperPlanesNetwork):
 
         Repeated calls give the same field. The order of the views changes it a little, because learned steps draw rays
         and views by position: pictures of two orders agree to 38 to 40 dB (docs/image-based.md).
+
+        A UserWarning is issued if the views have no masks and the hypernetwork reads a volume, which needs masks.
         """
+        self._warn_without_masks(support)
         placed = to_canonical_frame(self, support)
         context = placed.context(self)
         adapted = stacked_field(self, context, updated_weights(self, context))
         return corrected_field(self, placed.in_scene(adapted), support)
+
+    def _warn_without_masks(self, support: Views) -> None:
+        """Issue a UserWarning about missing masks if the hypernetwork reads a volume, which is made with masks."""
+        if self.reads_volume and (problem := masks_problem(support)):
+            warnings.warn(problem, stacklevel=2)
 
     @checked
     @without_autocast
@@ -138,11 +147,13 @@ class HyperPlanes(HyperPlanesNetwork):
             on_trial: the same for the trial steps of "auto", of which there are up to `settings.max_steps`.
 
         Returns:
-            The field. Raises ValueError for steps that are impossible: on a hypernetwork that the model does not have,
-            a negative number, "auto" with fewer than 3 views, or on a single view of a field that takes any number of
-            them, unless `settings.mask_views` is off. Raises NoProgressError, a ValueError with the final field, if the
-            steps do not lower the error. Raises RuntimeError inside `torch.inference_mode`.
+            The field. A UserWarning as that of `adapt`. Raises ValueError for steps that are impossible: on a
+            hypernetwork that the model does not have, a negative number, "auto" with fewer than 3 views, or on a single
+            view of a field that takes any number of them, unless `settings.mask_views` is off. Raises NoProgressError,
+            a ValueError with the final field, if the steps do not lower the error. Raises RuntimeError inside
+            `torch.inference_mode`.
         """
+        self._warn_without_masks(support)
         return fine_tune(self, support, steps, settings, on_step=on_step, on_trial=on_trial)
 
     def with_weights_of(self, adapted: AdaptedField) -> HyperPlanes:

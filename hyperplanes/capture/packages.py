@@ -42,6 +42,7 @@ def require(name: str, purpose: str) -> Any:
     except Exception as error:  # pycolmap raises RuntimeError after an ImportError or an interrupt
         if (interrupt := interrupt_behind(error)) is not None:
             raise interrupt from None
-        found = " ".join(str(error.__cause__ or error).split())
+        absent = isinstance(error, ModuleNotFoundError) and error.name == name
+        found = "none" if absent else " ".join(str(error.__cause__ or error).split())
         missing = f"expected the package {name}, which {purpose}, found {found}"
         raise ValueError(f"{missing}; pip install 'hyperplanes[photos]'") from error

@@ -1,5 +1,7 @@
 """The verbs of the command line. Each is a module with a dataclass `Arguments` and a function `run`.
 
+If the same command continues an interrupted one, the module has RESUMES = True.
+
 Another package adds a verb by an entry point of the group `hyperplanes.commands` that names a `Verb`, as data_gen does
 with `generate` and `inspect`. The module of that `Verb` must import nothing heavy.
 """

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Arguments", "run"]
 
+RESUMES = True  # the same command continues an interrupted one
+
 
 @dataclass(frozen=True)
 class Arguments:

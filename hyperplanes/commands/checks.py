@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from hyperplanes.utilities.entry_points import find_entries, load_entries
 from hyperplanes.utilities.machine.environment import usable_cores
+from hyperplanes.utilities.messages.formatting import counted
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -91,7 +92,7 @@ def _torch() -> Check:
     except (ImportError, OSError, RuntimeError) as error:
         return Check("torch", False, True, _first_line(error), "pip install torch, or make a new environment")
     cores = usable_cores()
-    where = f"CPU, {torch.get_num_threads()} threads on {cores} cores"
+    where = f"CPU, {counted(torch.get_num_threads(), 'thread')} on {counted(cores, 'core')}"
     if torch.cuda.is_available():
         where = f"GPU {torch.cuda.get_device_name()}, and {where}"
     elif torch.version.cuda:

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Arguments", "run", "settings_of"]
 
+RESUMES = True  # the same command continues an interrupted one
+
 
 @dataclass(frozen=True)
 class Arguments:

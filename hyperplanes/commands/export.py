@@ -21,6 +21,7 @@ from hyperplanes.commands.inputs.scene import read_object, refuse_sources
 from hyperplanes.commands.options import ObjectArguments, OptionalInt, check_orbit, optional
 from hyperplanes.commands.output.console import Console
 from hyperplanes.commands.output.writing import writes_to
+from hyperplanes.utilities.messages.formatting import counted
 
 if TYPE_CHECKING:
     from hyperplanes.adaptation.base import AdaptedField
@@ -128,7 +129,7 @@ def run(arguments: Arguments) -> int:
 
     if "images" in arguments.what:
         paths = save_images(render_views(field, query.cameras, console).images, out / "images", query.names)
-        console.say(f"{out / 'images'}: {len(paths)} pictures of the {_compared_with(arguments)} poses")
+        console.say(f"{out / 'images'}: {counted(len(paths), 'picture')} of the {_compared_with(arguments)} poses")
     if "turntable" in arguments.what:
         _write_turntable(field, shown, arguments, console, make=voxels)
     if "mesh" in arguments.what:
@@ -216,7 +217,6 @@ def _write_points(field: AdaptedField | BakedScene, shown: Views, arguments: Arg
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.export.surfaces.points import point_cloud, save_points
     from hyperplanes.utilities.messages.errors import rename_errors
-    from hyperplanes.utilities.messages.formatting import counted
 
     bounds = (field if isinstance(field, AdaptedField) else field.adapted).occupancy.bounds
     plain = field.without_residuals() if isinstance(field, AdaptedField) else field

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from hyperplanes.configuration.fine_tuning import Steps
-from hyperplanes.data.packaged import locate_scene
+from hyperplanes.data.packaged import locate_scene, remedy_for
 from hyperplanes.utilities.files.reading import DataError
 
 __all__ = [
@@ -68,7 +68,8 @@ class Exists:
         if place.is_dir() or (place.exists() and not self.folder):
             return
         missing = "a link to nothing" if place.is_symlink() else "nothing"
-        raise DataError(path, self.expected, "a file" if place.exists() else missing, self.remedy)
+        remedy = remedy_for(path, self.remedy) if self.packaged else self.remedy
+        raise DataError(path, self.expected, "a file" if place.exists() else missing, remedy)
 
 
 DATA_SET = Exists("the folder of a data set", "check the path, or run hyperplanes generate", packaged=True)

@@ -138,7 +138,7 @@ def _check_words(verb: str, declared: type, arguments: Sequence[str]) -> None:
         if not name:
             raise ValueError(f"expected an option, got {values[0]}; {more}")
         if name not in options:
-            raise ValueError(f"no option {name}{did_you_mean(name, options) or f'; {more}'}")
+            raise ValueError(f"no option {name}{did_you_mean(name, [*options, '--help']) or f'; {more}'}")
         options[name].check(values)
     missing = [name for name, option in options.items() if option.required and name not in given]
     if missing:

@@ -255,8 +255,8 @@ def _held_out(
     if scores is not None:
         without = " and residuals" if corrected else ""
         console.say(
-            f"without fine-tuning{without}, on held-out support views: {scores[0]:.2f} dB PSNR; "
-            f"copying the nearest view has {scores[1]:.2f} dB"
+            f"estimate, from fewer views than the pictures and without fine-tuning{without}: {scores[0]:.2f} dB PSNR "
+            f"on held-out support views; copying the nearest view has {scores[1]:.2f} dB"
         )
     return scores if arguments.steps == 0 else None
 
@@ -279,7 +279,7 @@ def _compared(
         quality += f", {float(ssim(images, known.images).mean()):.3f} SSIM"
     now = "not given now, but perhaps when it was adapted" if finished else "not given to the model"
     how = "given to the model as well" if all_views else now
-    console.say(f"against the {len(known)} true views, {how}: {quality}")
+    console.say(f"against the {counted(len(known), 'true view')}, {how}: {quality}")
     if all_views:
         return None
     copied = NearestView().adapt(shown).render(known.cameras).images

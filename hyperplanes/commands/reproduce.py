@@ -40,6 +40,8 @@ __all__ = ["Arguments", "data_sets", "run"]
 BROUGHT = {"Tables": "hyperplanes.tables"}
 """Groups of entry points whose names are tables, by their heading in the help."""
 
+RESUMES = True  # the same command continues an interrupted one
+
 
 @dataclass(frozen=True)
 class Arguments:

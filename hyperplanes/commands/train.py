@@ -43,10 +43,10 @@ from hyperplanes.commands.options import (
     Protocol,
 )
 from hyperplanes.commands.output.console import Bar, Console
-from hyperplanes.commands.output.writing import writes_to
+from hyperplanes.commands.output.writing import refuse_foreign, writes_to
 from hyperplanes.utilities.machine.interrupts import SIGNALS, HungUp, listened_to
 from hyperplanes.utilities.machine.processes import is_first_process
-from hyperplanes.utilities.messages.formatting import format_duration, format_rate
+from hyperplanes.utilities.messages.formatting import counted, format_duration, format_rate
 from hyperplanes.utilities.messages.shell import command_line
 
 if TYPE_CHECKING:
@@ -60,6 +60,8 @@ __all__ = ["Arguments", "follow", "progress_line", "resolve", "run"]
 
 BROUGHT = {"Fields": "hyperplanes.fields"}
 """Groups of entry points whose names are fields and methods, by their heading in the help."""
+
+RESUMES = True  # the same command continues an interrupted one
 
 SAME = {
     "steps": ("training.steps", "training.epochs"),
@@ -320,9 +322,11 @@ def _opened(arguments: Arguments, chosen: Preset, console: Console) -> Tasks:
     for line in data.skipped:
         console.warn(line)
     if not data.names("train"):
+        others = counted(len(data.names()), "object")
         raise ValueError(
-            f"{' '.join(map(str, arguments.data))}: expected objects to train on, found none in its train split; "
-            "a single scene can only be rendered or evaluated"
+            f"{' '.join(map(str, arguments.data))}: expected objects to train on, found none in its train split and "
+            f"{others} in the others; scenes without a split can only be rendered or evaluated, and `hyperplanes "
+            "generate` makes a data set with one"
         )
     if arguments.support is not None and chosen.training.views:
         raise ValueError(
@@ -344,6 +348,8 @@ def _run(arguments: Arguments) -> int:
     if arguments.out.resolve() in {path.resolve() for path in arguments.data}:
         raise ValueError(f"--out: expected a folder of its own, got {arguments.out}, which is --data; name another one")
     first = _is_first(arguments)
+    if first:
+        refuse_foreign(arguments.out)
     console = Console(silent=not first)
     chosen = resolve(arguments)
     method = chosen.model.method
@@ -365,7 +371,7 @@ def _run(arguments: Arguments) -> int:
         shared = f", shared by {trainer.processes.count} processes" if trainer.processes.count > 1 else ""
         console.say(
             f"{method}: {sum(p.numel() for p in trainer.model.parameters()):,} weights, "
-            f"{len(trainer.loader.names)} objects to train on, {held_out} held out{shared}"
+            f"{counted(len(trainer.loader.names), 'object')} to train on, {held_out} held out{shared}"
         )
         if trainer.step:
             console.say(f"resuming from step {trainer.step}")

@@ -32,6 +32,7 @@ from hyperplanes.commands.inputs.scene import prepare_task, read_scene
 from hyperplanes.commands.options import POSED_IMAGES, ViewsArguments
 from hyperplanes.commands.output.console import Console
 from hyperplanes.utilities.machine.interrupts import Terminated
+from hyperplanes.utilities.messages.errors import did_you_mean, prefix_errors
 from hyperplanes.utilities.messages.formatting import counted
 
 if TYPE_CHECKING:
@@ -46,6 +47,9 @@ if TYPE_CHECKING:
 __all__ = ["Arguments", "run"]
 
 EVERY = 5  # fine-tuning steps between two pictures
+
+ALWAYS_SHOWN, OF_A_MODEL = ("hull_blend", "nearest_view"), ("hyperplanes", "hyperplanes_100", "scratch_100")
+"""Methods to compare with that need no checkpoint, and those that need that of the model."""
 
 
 @dataclass(frozen=True)
@@ -127,17 +131,22 @@ def run(arguments: Arguments) -> int:
 def _others(arguments: Arguments, device: torch.device) -> dict[str, Adapter]:
     """The methods to compare with, by name."""
     from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
-    from hyperplanes.methods import Request, make_method
+    from hyperplanes.methods import Request, is_method, make_method
 
     if not arguments.compare:
         return {}
     model = arguments.checkpoint
     checkpoints = {} if model.is_file() else find_checkpoints([model]) | {"hyperplanes": find_checkpoint(model)}
     reflections = not arguments.no_reflections
-    return {
-        name: make_method(Request(name, checkpoints, device=device, reflections=reflections))
-        for name in arguments.compare
-    }
+    usual = [*ALWAYS_SHOWN, *(OF_A_MODEL if checkpoints else ())]
+    made = {}
+    for name in arguments.compare:
+        if not is_method(name):
+            near = did_you_mean(name, usual)
+            raise ValueError(f"--compare: expected a method such as {', '.join(usual)}, got {name!r}{near}")
+        with prefix_errors("--compare"):
+            made[name] = make_method(Request(name, checkpoints, device=device, reflections=reflections))
+    return made
 
 
 class _Superseded(Exception):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from hyperplanes.adaptation.base import Renderable
+from hyperplanes.adaptation.base import Renderable, masks_problem, no_masks_warning
 from hyperplanes.adaptation.baselines.nearest_view import NearestView
 from hyperplanes.adaptation.context import observe
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
@@ -14,7 +14,6 @@ from hyperplanes.views import Views
 
 __all__ = ["FEWEST_VIEWS", "held_out_psnr", "suitability_warnings", "worse_than_copying"]
 
-MAX_MASK_COVERAGE = 0.95  # mean opacity above which masks are as good as no masks
 # standardised codes, root mean square: 0.7 to 2 for held-out objects of a trained class, others 3.3 to 8
 MAX_CODE_DISTANCE = 3.0
 ELSEWHERE = 30.0  # mean degrees between the directions of cameras and of the planes that they fill, above which to warn
@@ -33,13 +32,8 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
         steps: the requested fine-tuning steps.
     """
     found = []
-    covered = _covered(shown)
-    if covered > MAX_MASK_COVERAGE:
-        what = "no alpha and no masks" if shown.masks is None else f"masks that cover {covered:.0%}"
-        found.append(
-            f"the views have {what}, but the model was trained on objects over white, so it would treat the background "
-            "as a part of the object; cut the object out (RGBA images, or a folder masks/), or give --learn-background"
-        )
+    if problem := masks_problem(shown):
+        found.append(f"{problem}, or give --learn-background")
     planes = model.config.network.planes
     if len(shown) < planes and len(model.known_rig):
         stated = f"{len(shown)} support views are given and the model was trained with {planes}"
@@ -57,11 +51,6 @@ def suitability_warnings(model: HyperPlanes, shown: Views, steps: object = 0) ->
     return found
 
 
-def _covered(shown: Views) -> float:
-    """Mean opacity of the masks; 1 without masks."""
-    return 1.0 if shown.masks is None else float(shown.masks.mean())
-
-
 def worse_than_copying(shown: Views, rendered: float, copied: float, steps: object) -> list[str]:
     """A warning if the pictures of a field are worse than copies of the nearest support view; otherwise no warning.
 
@@ -76,7 +65,7 @@ def worse_than_copying(shown: Views, rendered: float, copied: float, steps: obje
     advice = "`hyperplanes inspect` checks images, masks and poses"
     if steps == 0 and len(shown) > 1:
         advice += ", and --steps 100 adapts the model to the views"
-    advice = "cut the object out first" if _covered(shown) > MAX_MASK_COVERAGE else advice
+    advice = "cut the object out first" if masks_problem(shown) else advice
     return [f"worse than copying the nearest view: {rendered:.2f} dB against {copied:.2f} dB; {advice}"]
 
 
@@ -99,7 +88,8 @@ def held_out_psnr(model: HyperPlanes, shown: Views) -> tuple[float, float] | Non
     rest = [index for index in range(len(shown)) if index not in holdout.tolist()]
     shown = shown.resized(SHOWN_SIZE)
     left_out, remaining = shown[holdout].resized(HELD_OUT_SIZE), shown[rest]
-    fields: list[Renderable] = [model.adapt(remaining).without_residuals(), NearestView().adapt(remaining)]
+    with no_masks_warning():
+        fields: list[Renderable] = [model.adapt(remaining).without_residuals(), NearestView().adapt(remaining)]
     pictures = (each.render(left_out.cameras).images.clamp(0, 1) for each in fields)
     first, second = (float(psnr(images, left_out.images).mean()) for images in pictures)
     return first, second

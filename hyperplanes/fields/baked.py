@@ -143,7 +143,10 @@ class BakedField:
         path = Path(path)
         found = load_tensors(path)
         if {name: value.dtype for name, value in found.items()} != STORED:
-            raise CheckpointError(f"{path}: expected a baked field, found tensors {sorted(found)}; `hyperplanes bake`")
+            is_model = (path.parent / "model.json").exists()
+            remedy = f"give the folder {path.parent} for a model" if is_model else "`hyperplanes bake` writes one"
+            names = ", ".join(sorted(found)[:3]) + ", ..." * (len(found) > 3) or "none"
+            raise CheckpointError(f"{path}: expected a baked field, found other tensors ({names:.80}); {remedy}")
         bits = torch.from_numpy(np.unpackbits(found["occupied"].numpy(), bitorder="little")).bool()
         side, rows, numbers = round(len(bits) ** (1 / 3)), int(bits.sum()), 3 * HARMONICS
         shapes = {"scaled_density": (rows,), "coefficients": (rows, numbers), "range": (2, numbers), "sphere": (4,)}

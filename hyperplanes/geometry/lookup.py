@@ -22,6 +22,7 @@ from hyperplanes.geometry.inputs import (
 from hyperplanes.geometry.lookup_torch import MIN_Z
 from hyperplanes.geometry.packed_images import PackedImages
 from hyperplanes.utilities.messages.arguments import kind_of
+from hyperplanes.utilities.messages.formatting import counted
 from hyperplanes.utilities.tensors.transforms import transform_of
 
 __all__ = ["Backend", "Lookup", "backends", "choose", "lookup", "sample"]
@@ -72,7 +73,8 @@ def backends() -> list[Backend]:
     if not _INSTALLED["numba"]:
         found.append(Backend("cpu", False, "needs numba: pip install numba"))
     else:
-        found.append(Backend("cpu", True, f"numba kernels, {torch.get_num_threads()} threads; the default on the CPU"))
+        threads = counted(torch.get_num_threads(), "thread")
+        found.append(Backend("cpu", True, f"numba kernels, {threads}; the default on the CPU"))
     if not _INSTALLED["triton"]:
         found.append(Backend("triton", False, "needs triton, which comes with PyTorch for CUDA"))
     elif not torch.cuda.is_available():

@@ -13,8 +13,10 @@ from hyperplanes.adaptation.fine_tuning import fine_tune_to
 from hyperplanes.adaptation.gating import GatingNetwork, readings
 from hyperplanes.adaptation.optimisation.descent import Descent
 from hyperplanes.commands import view
+from hyperplanes.commands.inputs.fields import adapt_to
 from hyperplanes.commands.output.console import Console
 from hyperplanes.configuration.fine_tuning import MANY_VIEWS, FineTuning
+from hyperplanes.evaluation.suitability import held_out_psnr
 from hyperplanes.geometry.rays import cast
 from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.training import gating
@@ -73,7 +75,18 @@ def test_pixels_are_gated_with_five_or_more_masked_views():
     for count in (MIN_VIEWS - 1, MIN_VIEWS):
         support = ball_views(ring(count, (24, 24)))
         assert isinstance(adapter.adapt(support), StackedField) == (count == MIN_VIEWS)
-        assert not isinstance(adapter.adapt(replace(support, masks=None)), StackedField)
+        with pytest.warns(UserWarning, match="the views have no alpha and no masks, but the model"):
+            unmasked = adapter.adapt(replace(support, masks=None))
+        assert not isinstance(unmasked, StackedField)
+
+
+def test_a_command_reports_missing_masks_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HYPERPLANES_CACHE", str(tmp_path))
+    views = replace(ball_views(ring(MIN_VIEWS, (24, 24))), masks=None)
+    adapter = HyperPlanes(CONFIG)
+    adapt_to(adapter, views, "ball", Console())  # a warning of the model itself would be an error
+    held_out_psnr(adapter, views)
+    assert "".join(capsys.readouterr()).count("no alpha and no masks") == 1
 
 
 def test_fine_tuned_pictures_are_gated_with_ten_or_more_masked_views():
@@ -84,7 +97,8 @@ def test_fine_tuned_pictures_are_gated_with_ten_or_more_masked_views():
     for count in (MANY_VIEWS - 1, MANY_VIEWS):
         support = ball_views(ring(count, (24, 24)))
         tuned = adapter.fine_tune(support, 1, settings)
-        unmasked = adapter.fine_tune(replace(support, masks=None), 1, settings)
+        with pytest.warns(UserWarning, match="no alpha and no masks"):
+            unmasked = adapter.fine_tune(replace(support, masks=None), 1, settings)
         assert [isinstance(each, AveragedField) for each in (tuned, unmasked)] == [count < MANY_VIEWS] * 2
         assert isinstance(tuned, StackedField)
         assert isinstance(unmasked, StackedField) == (count < MANY_VIEWS)

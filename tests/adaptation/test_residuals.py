@@ -328,6 +328,7 @@ def test_a_model_without_residuals_is_another_one_with_the_same_weights(many):
     assert corrected.hypernetwork is not None
 
 
+@pytest.mark.filterwarnings("ignore:the views have no alpha and no masks")
 def test_pictures_of_few_or_large_views_or_without_masks_are_not_corrected(many, monkeypatch):
     assert isinstance(model().adapt(many[: residuals.MIN_CORRECTED_VIEWS]), CorrectedField)
     for others in (many[: residuals.MIN_CORRECTED_VIEWS - 1], replace(many, masks=None)):

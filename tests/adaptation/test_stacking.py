@@ -259,7 +259,8 @@ def test_few_views_or_views_without_masks_give_no_share():
     few[sorted(outermost_first(support.camera_directions, 6)[:-2])] = 0
     assert hull_share(hold_out(model(empty=True), replace(support, masks=few))) == 0  # masks of given views are empty
     saved = HyperPlanes(replace(CONFIG, stacked=False, hull_share=0.5))
-    assert not isinstance(saved.adapt(replace(support, masks=None)), StackedField)
+    with pytest.warns(UserWarning, match="no alpha and no masks"):
+        assert not isinstance(saved.adapt(replace(support, masks=None)), StackedField)
     assert isinstance(saved.adapt(support), StackedField)
 
 

@@ -32,6 +32,11 @@ def test_a_package_that_cannot_be_imported_is_named_in_one_line(code, found, tmp
     assert str(raised.value).endswith(f"found {found}; pip install 'hyperplanes[photos]'")
 
 
+def test_a_package_that_is_not_installed_is_named_as_absent():
+    with pytest.raises(ValueError, match=r"expected the package absent_package, which does it, found none; pip"):
+        require("absent_package", "does it")
+
+
 def test_a_keyboard_interrupt_during_an_import_is_raised(tmp_path, monkeypatch):
     (tmp_path / "interrupted_package.py").write_text(WRAPPED.format(raised="KeyboardInterrupt"))
     monkeypatch.syspath_prepend(tmp_path)

@@ -70,7 +70,7 @@ def test_ctrl_c_ends_a_page_without_an_error_and_a_termination_is_reported(numbe
     assert main(["view", "example-car", "--fit", "0"]) == code
     assert viewer.made[0].stopped
     errors = capfd.readouterr().err
-    assert "resumes where possible" not in errors
+    assert "run the same command again" not in errors
     assert "--port: 8080 is in use" in errors  # the page uses another port
     assert ("terminated; the page is closed" in errors) == (code == 143)
 
@@ -129,6 +129,23 @@ def test_the_model_can_be_named_by_its_method_in_compare(tmp_path):
     names = ("point_multiplane", "hyperplanes", "nearest_view")
     found = view._others(view.Arguments(Path("example-car"), tmp_path, compare=names), torch.device("cpu"))
     assert [found[name].config for name in names[:2]] == [model.config] * 2
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "hull_bland",
+            r"--compare: expected a method such as hull_blend, .*, got 'hull_bland'; did you mean hull_blend\?",
+        ),
+        ("maml", "--compare: method maml: expected a checkpoint of maml, got none"),
+    ],
+)
+def test_a_method_that_cannot_be_compared_with_is_refused(name, message, tmp_path):
+    small_model(hypernetwork=None).save(tmp_path)
+    with pytest.raises(ValueError, match=message) as raised:
+        view._others(view.Arguments(Path("example-car"), tmp_path, compare=(name,)), torch.device("cpu"))
+    assert "autoencoder" not in str(raised.value)
 
 
 @pytest.mark.parametrize("option", [["--steps", "1"], ["--refine-poses"], ["--learn-background"], ["--fit", "0"]])

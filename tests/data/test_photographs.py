@@ -114,7 +114,7 @@ def test_frames_that_are_missing_are_left_out_and_named(scene, tmp_path):
     folder = scene.write(tmp_path, document)
     for name in (scene.names[1], scene.names[6]):
         (tmp_path / name).unlink()
-    said = "6 of 8 frames have an image, 2 are missing: images/001.png, images/006.png"
+    said = "6 of 8 frames have an image; missing: images/001.png, images/006.png"
     with pytest.warns(UserWarning, match=re.escape(said)):
         task = read_task(folder)
     assert task.support.names == tuple(scene.names[at] for at in (0, 2, 3, 4))

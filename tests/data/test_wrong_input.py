@@ -27,6 +27,7 @@ def test_missing_and_empty_folders(tmp_path):
     for action in (read_views, read_task, open_dataset):
         refused(action, tmp_path / "absent", match="absent: expected .* found nothing; check the path")
         refused(action, tmp_path, match="(an empty folder|neither)")
+        refused(action, "example-cars", match=r"found nothing; did you mean example-car\?$")
     (tmp_path / "notes.txt").write_text("none of these")
     refused(open_dataset, tmp_path / "notes.txt", match=r"notes.txt: expected the folder of a data set, found a file")
 

@@ -179,8 +179,14 @@ def test_a_file_that_is_not_a_baked_field_is_refused(tmp_path):
     from hyperplanes.utilities.files.checkpoints import save_tensors
 
     save_tensors(tmp_path / "other.safetensors", {"weights": torch.zeros(3)})
-    with pytest.raises(CheckpointError, match=r"other\.safetensors: expected a baked field"):
+    with pytest.raises(
+        CheckpointError, match=r"other\.safetensors: expected a baked field, .*\(weights\).*bake` writes"
+    ):
         BakedField.load(tmp_path / "other.safetensors")
+    save_tensors(tmp_path / "model.safetensors", {f"fine.{index}": torch.zeros(3) for index in range(50)})
+    (tmp_path / "model.json").touch()
+    with pytest.raises(CheckpointError, match=r"fine\.10, \.\.\.\); give the folder \S+ for a model$"):
+        BakedField.load(tmp_path / "model.safetensors")
     (tmp_path / "cut.safetensors").write_bytes(b"\x10\x00")
     with pytest.raises(CheckpointError, match=r"cut\.safetensors"):
         BakedField.load(tmp_path / "cut.safetensors")

@@ -43,6 +43,10 @@ def field(points, directions):
             lambda: cameras.look_at(PICTURES[0, :, 0, :3], (0.0, 1.0)),
             "target: expected a tuple of 3 numbers, got a tuple",
         ),
+        (
+            lambda: ImagePlanes(PICTURES, VIEWS),
+            r"cameras: expected PinholeCamera, got a hyperplanes.views.Views; pass its .cameras$",
+        ),
         (lambda: ImagePlanes(PICTURES, PICTURES), "cameras: expected PinholeCamera, got a tensor of float32"),
         (lambda: FineTuning(optimiser="lion"), "optimiser: expected one of 'adam', 'muon', 'sgd' or None, got 'lion'"),
         (lambda: HyperPlanes.from_pretrained(3), "name: expected Path or str, got 3"),

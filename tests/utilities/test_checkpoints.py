@@ -68,6 +68,13 @@ def test_a_truncated_file_is_refused(weights, share):
     assert "copy it again" in error_line(weights, lambda: load_tensors(weights))
 
 
+@pytest.mark.parametrize("content", [b"glTF\x02\0\0\0\x10\0\0\0", b"a note about this model"])
+def test_a_file_of_another_kind_is_no_damaged_checkpoint(weights, content):
+    weights.write_bytes(content)
+    message = error_line(weights, lambda: load_tensors(weights))
+    assert message.endswith("found a file of another kind, which is no checkpoint; check the path")
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -55,7 +55,9 @@ def test_a_signal_while_a_file_is_written_leaves_nothing_behind(verb, number, co
     capsys.readouterr()
     assert main([verb, *given]) == code
     ending = "interrupted" if code == 130 else "terminated"
-    assert capsys.readouterr().err == f"hyperplanes {verb}: {ending}; the same command resumes where possible\n"
+    resumes = verb in ("generate", "train", "demo", "reproduce")
+    advice = "the same command resumes where possible" if resumes else "run the same command again to start over"
+    assert capsys.readouterr().err == f"hyperplanes {verb}: {ending}; {advice}\n"
     assert not [path for path in out.rglob("*") if path.suffix == ".part" or path.name == ".lock"]
     assert children() <= before
 

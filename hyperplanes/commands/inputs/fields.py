@@ -113,6 +113,7 @@ def adapt_to(
         The field, and the warnings.
     """
     from hyperplanes.adaptation.alignment.rotation import RotatedField
+    from hyperplanes.adaptation.base import no_masks_warning
     from hyperplanes.adaptation.correction.stacking import AveragedField, StackedField
     from hyperplanes.commands.inputs.disk_cache import keep_field, kept_folder, recall_field
     from hyperplanes.configuration.fine_tuning import FineTuning
@@ -131,7 +132,7 @@ def adapt_to(
     if kept is not None:
         console.say(f"{name}: adapted to the same views before; read from {folder}")
         return kept, warned
-    with console.bar("fine-tuning") as bar:
+    with console.bar("fine-tuning") as bar, no_masks_warning():
 
         def count(done: int) -> None:
             taken.append(done)

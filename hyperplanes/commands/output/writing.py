@@ -13,12 +13,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hyperplanes.commands.output.console import Console
 
-__all__ = ["check_output", "keep_if_possible", "refuse_checkpoint", "writes_to"]
+__all__ = ["check_output", "keep_if_possible", "refuse_checkpoint", "refuse_foreign", "writes_to"]
 
 READ = re.compile(
     r"(manifest|model|training|transforms|diagnostics|initial)([-_]\w+)?\.json|.*_splits\.json|config\.yaml"
 )
 """Names of files that are read as a part of a model, a training or a data set."""
+
+TRAINING = {"config.yaml", "initial.json", "model.json", "model.safetensors", "training.json"}
+"""Files of which a folder of a training has at least one."""
 
 WEIGHTS = re.compile(r"(model|training-\d+)\.safetensors")
 
@@ -56,6 +59,23 @@ def refuse_checkpoint(out: Path, checkpoint: Path) -> None:
         taken = out.resolve() in {path.resolve() for path in models} or (out / "training.json").exists()
     if taken:
         raise ValueError(f"--out: expected a path without a trained model, got {out}, where one is; name another")
+
+
+def refuse_foreign(out: Path) -> None:
+    """Refuse a folder for a training that has files, but none of a training.
+
+    Args:
+        out: the folder; it need not exist.
+
+    Raises:
+        DataError: such a folder.
+    """
+    from hyperplanes.utilities.files.reading import DataError
+
+    names = {path.name for path in out.iterdir()} - {".lock"} if out.is_dir() else set()
+    if names and names.isdisjoint(TRAINING):
+        found = ", ".join(sorted(names)[:3])
+        raise DataError(out, "an empty folder or that of a training", found, "name another one")
 
 
 def check_output(option: str, path: Path | None) -> None:

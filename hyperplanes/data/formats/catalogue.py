@@ -9,9 +9,9 @@ from typing import Any
 
 from hyperplanes.data.formats.scenes.transforms_json import read_transforms_task
 from hyperplanes.data.pictures.posed import PosedTask
-from hyperplanes.utilities.files.reading import LONGEST_NAME, MANIFEST, DataError
+from hyperplanes.utilities.files.reading import LONGEST_NAME, MANIFEST, PROGRESS_FOLDER, DataError, read_json
 
-__all__ = ["SPLITS", "Catalogue", "is_plain", "native"]
+__all__ = ["SPLITS", "Catalogue", "is_plain", "native", "refuse_unfinished"]
 
 SPLITS = ("train", "val", "test")
 
@@ -54,6 +54,25 @@ def native(folder: Path, manifest: dict[str, Any]) -> Catalogue:
         return read_transforms_task(folder / name, name, complete=True, root=folder)
 
     return Catalogue("native", splits, read, manifest)
+
+
+def refuse_unfinished(folder: Path) -> None:
+    """Refuse a data set whose generation was interrupted: it has no splits yet.
+
+    A data set with a manifest was finished before.
+
+    Raises:
+        DataError: `generate` has not finished writing into the folder.
+    """
+    progress = folder / PROGRESS_FOLDER
+    if (folder / MANIFEST).is_file() or not (progress / "configuration.json").is_file():
+        return
+    source = read_json(progress / "configuration.json").get("source")
+    total = source.get("count", source.get("meshes")) if isinstance(source, dict) else None
+    written = sum(1 for _ in (progress / "done").glob("*.json"))
+    of_all = f" of {total}" if isinstance(total, int) else ""
+    found = f"an unfinished one ({written}{of_all} objects)"
+    raise DataError(folder, "a finished data set", found, "run the same `hyperplanes generate` command again")
 
 
 def manifest_splits(source: Path, manifest: dict[str, Any]) -> dict[str, tuple[str, ...]]:

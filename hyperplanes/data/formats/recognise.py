@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hyperplanes.data.formats.apps import metashape, polycam, realitycapture, record3d
-from hyperplanes.data.formats.catalogue import Catalogue, native
+from hyperplanes.data.formats.catalogue import Catalogue, native, refuse_unfinished
 from hyperplanes.data.formats.collections import co3d, nmr, npz, objaverse, srn
 from hyperplanes.data.formats.scenes import colmap, idr, llff, nsvf
 from hyperplanes.data.formats.scenes.transforms_json import find_transforms, read_transforms, read_transforms_task
 from hyperplanes.data.formats.unposed import refuse_unposed
+from hyperplanes.data.packaged import remedy_for
 from hyperplanes.data.pictures.frames import Listing, assemble
 from hyperplanes.data.pictures.posed import Posed, PosedTask
 from hyperplanes.utilities.entry_points import load_entries
@@ -103,7 +104,8 @@ def find_catalogue(path: str | Path, *, legacy: bool = False) -> Catalogue:
         The catalogue. No image has been read yet.
 
     Raises:
-        DataError: no known layout, or `legacy` with another layout than these two.
+        DataError: no known layout, a data set that `generate` has not finished, or `legacy` with another layout than
+            these two.
     """
     path = Path(path)
     found = _find_catalogue(path, legacy)
@@ -119,7 +121,9 @@ def _find_catalogue(path: Path, legacy: bool) -> Catalogue:
     if not path.is_dir():
         refuse_unposed(path)
         what = "a file" if path.exists() else "nothing"
-        raise DataError(path, "the folder of a data set", what, "check the path, or run hyperplanes generate")
+        remedy = remedy_for(path, "check the path, or run hyperplanes generate")
+        raise DataError(path, "the folder of a data set", what, remedy)
+    refuse_unfinished(path)
     manifest = read_json(path / MANIFEST) if (path / MANIFEST).is_file() else {}
     if manifest.get("format") == DATA_SET and manifest.get("layout", "native") == "native":
         return native(path, manifest)
@@ -222,6 +226,6 @@ def _format(folder: Path) -> Layout:
     refuse_unposed(folder)
     if not folder.is_dir():
         found = "a file of another kind" if folder.exists() else "nothing"
-        raise DataError(folder, "a transforms*.json or the folder of a scene", found, "check the path")
+        raise DataError(folder, "a transforms*.json or the folder of a scene", found, remedy_for(folder))
     names = ", ".join(sorted(child.name for child in folder.iterdir())[:5]) or "an empty folder"
     raise DataError(folder, "transforms.json or another layout of one scene", names, "give one object's folder")

@@ -184,7 +184,7 @@ def _present(frames: Sequence[Frame], source: str | Path, complete: bool) -> tup
         )
     if missing:
         names = listed([frame.name for frame in missing])
-        notes.append(f"{len(there)} of {len(frames)} frames have an image, {len(missing)} are missing: {names}")
+        notes.append(f"{len(there)} of {len(frames)} frames have an image; missing: {names}")
     first: dict[Path, int] = {}
     for index in there:
         first.setdefault(frames[index].path.resolve(), index)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,9 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
         Tensors by name. DataError where there is no regular file.
 
     Raises:
-        CheckpointError: no such file, a damaged one, other names or shapes than expected, tensors that do not match
-            their checksum (files of other programs have none), or a number that is not finite.
+        CheckpointError: no such file, a damaged one or one of another kind, other names or shapes than expected,
+            tensors that do not match their checksum (files of other programs have none), or a number that is not
+            finite.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -86,9 +88,9 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
             checksum = (file.metadata() or {}).get(CHECKSUM)
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     except (SafetensorError, OSError, ValueError, TypeError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{path}: expected whole safetensors, found a damaged file ({error}); copy it again"
-        ) from None
+        damaged = f"expected whole safetensors, found a damaged file ({error}); copy it again"
+        other = "expected safetensors, found a file of another kind, which is no checkpoint; check the path"
+        raise CheckpointError(f"{path}: {other if _is_of_another_kind(path) else damaged}") from None
     if expected is not None:
         check_tensors(path, found, expected)
     if checksum is not None and checksum != _checksum(found):
@@ -99,6 +101,13 @@ def load_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
     if (name := _not_finite(found)) is not None:
         raise CheckpointError(f"{path}: expected finite numbers, found NaN or infinity in {name}; train or bake again")
     return {name: value.clone() for name, value in found.items()}  # own, aligned memory
+
+
+def _is_of_another_kind(path: Path) -> bool:
+    """Whether a file does not begin as safetensors do: with the length of a JSON object in 8 bytes, and the object."""
+    with suppress(OSError), open(path, "rb") as file:
+        return file.read(9)[8:] not in (b"", b"{")
+    return False
 
 
 def _checksum(tensors: Mapping[str, Tensor]) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 __all__ = [
     "DATA_SET",
     "MANIFEST",
+    "PROGRESS_FOLDER",
     "DataError",
     "check_link",
     "check_regular",
@@ -33,6 +34,9 @@ __all__ = [
 
 MANIFEST, DATA_SET = "manifest.json", "hyperplanes-dataset"
 """The file that describes a data set, and the value of "format" in it."""
+
+PROGRESS_FOLDER = ".progress"
+"""The folder in a data set that `generate` removes when all objects are written."""
 
 LARGEST_JSON = 256 * 2**20
 """Largest JSON file that is read, in bytes."""

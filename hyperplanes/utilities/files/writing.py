@@ -24,7 +24,7 @@ UNFINISHED = re.compile(r"\..+\.(\d+)-\d+\.part")
 
 
 class WriteError(DataError, OSError):
-    """A file that cannot be written: no space, no permission, or another failure of the operating system.
+    """A file that cannot be written: no space, no permission, a file in place of its folder, or another failure.
 
     Args:
         path: the file.
@@ -36,7 +36,11 @@ class WriteError(DataError, OSError):
         found, remedy = error.strerror or str(error), "check the folder and its permissions"
         if error.errno in {errno.ENOSPC, errno.EDQUOT}:
             found, remedy = f"a full disk ({found})", "free some and run the same command again"
-        super().__init__(path, f"room to write {size} bytes", found, remedy)
+        expected = f"room to write {size} bytes"
+        above = next((each for each in path.parents if os.path.exists(each)), path)
+        if error.errno in {errno.EEXIST, errno.ENOTDIR} and above.is_file():
+            path, expected, found, remedy = above, "a folder to write into", "a file", "name another one"
+        super().__init__(path, expected, found, remedy)
 
 
 def write_whole(path: str | Path, data: bytes, scratch: str | Path | None = None, *, durable: bool = True) -> None:

@@ -82,7 +82,9 @@ def _checking(function: Callable[P, R], annotated: Any) -> Callable[P, R]:
         for name, value in given.items():
             hint = looked_at.get(name, Any)
             if hint is not Any and (problem := mismatch(value, hint)):
-                raise ValueError(f"{name}: {problem}")
+                held = getattr(value, name, None)  # such as the cameras of views
+                remedy = f"; pass its .{name}" if held is not None and _fits(held, hint) else ""
+                raise ValueError(f"{name}: {problem}{remedy}")
         return function(*positional, **named)
 
     return called

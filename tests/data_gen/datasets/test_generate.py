@@ -119,6 +119,8 @@ def test_verify_finds_missing_and_changed_files(whole, tmp_path):
 def goes_on(out, whole, reused):
     """Check that a second run completes a data set that was interrupted after some objects."""
     assert not (out / "manifest.json").exists(), "the end of the run was not awaited"
+    with pytest.raises(DataError, match=r"found an unfinished one \(\d of 5 objects\); run the same"):
+        Dataset(out)
     (out / ".progress/unfinished/.junk.part").write_bytes(b"half a file")
     with rendered_here():
         report = generate(CARS, out, GenerationConfig(held_out=2, **SMALL))
@@ -162,7 +164,7 @@ def test_the_number_of_workers_changes_nothing(whole, tmp_path):
 
 
 def test_another_configuration_in_the_same_folder_is_refused(whole):
-    with pytest.raises(DataError, match=r"cars: expected the data set it holds \(views 4\), found a request for"):
+    with pytest.raises(DataError, match=r"cars: expected the data set it holds \(--views 4\), found a request for"):
         generate(CARS, whole[0], GenerationConfig(held_out=2, views=6, resolution=16))
 
 
@@ -209,6 +211,8 @@ def test_a_broken_mesh_is_skipped_with_a_reason_and_the_others_are_rendered(tmp_
     fewer, line, other = remarks(report, tmp_path / "out")
     assert fewer == "fewer objects in the split train: 3 of 5; repair what was skipped, or choose another --held-out"
     assert line.startswith("drawn without a texture or another file that they name: 1 of 3 objects (grey), listed in")
+    assert line.endswith("under with_lost_files; the text is in the warnings of each object, under objects")
+    assert any("gone.mtl" in text for text in manifest["objects"]["grey"]["warnings"])
     assert "taken in another format: 1 of the files (ball.fbx), listed in" in other
 
 
@@ -227,7 +231,9 @@ def test_a_split_with_skipped_objects_is_named(tmp_path):
         report = generate(MeshFolder(meshes), tmp_path / "out", GenerationConfig(**SMALL))
         assert [line.partition(";")[0] for line in remarks(report, tmp_path / "out")] == lines
     alone = generate(Procedural("car", 1), tmp_path / "one", GenerationConfig(held_out=0.5, **SMALL))
-    assert [line.partition(";")[0] for line in remarks(alone, tmp_path)] == ["no objects in the split test: 0 of 1"]
+    assert remarks(alone, tmp_path) == [
+        "no objects in the split test: 0 of 1; one more object is needed, because one alone is not held out"
+    ]
 
 
 def test_the_up_axis_is_that_of_the_format_except_for_named_files_and_folders(tmp_path):
