@@ -55,7 +55,7 @@ class HyperPlanes(HyperPlanesNetwork):
 
     def without_residuals(self) -> Self:
         """A model with the same weights without residual correction of its pictures (`correction.residuals`)."""
-        return self._configured(residuals=False)
+        return self._configured(residuals=False, learned_correction=False)
 
     def _configured(self, **changes: Any) -> Self:
         """A model that shares the weights of this one and has another configuration."""
@@ -172,12 +172,19 @@ class HyperPlanes(HyperPlanesNetwork):
         learned = learned_part(adapted)
         beside = {"hull_share": learned.share, "gated": learned.gate is not None, "average": learned.average}
         azimuth = -adapted.rotation.angle if isinstance(adapted, RotatedField) else 0.0
-        beside |= {"symmetric": False, "symmetry": adapted.symmetry, "azimuth": azimuth}
+        beside |= {
+            "learned_correction": self.corrector is not None,
+            "symmetric": False,
+            "symmetry": adapted.symmetry,
+            "azimuth": azimuth,
+        }
         found = {"fine": learned.field.field, "coarse": learned.field.proposal}
         shape = self.target.config_of(self.target.parameters_of(found["fine"]))
         result = HyperPlanes(replace(self.config.target_alone(), network=shape, **beside)).to(self.rig)
         if result.gate is not None and learned.gate is not None:
             result.gate.load_state_dict(learned.gate.state_dict())
+        if result.corrector is not None and self.corrector is not None:
+            result.corrector.load_state_dict(self.corrector.state_dict())
         result.rig.copy_(self.rig)
         pairs = [(network, found[name]) for name, network in result.targets.items()]
         if learned.before is not None:

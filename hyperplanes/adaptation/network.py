@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.context import SupportContext, live_pixels, observe
+from hyperplanes.adaptation.correction.correction_network import CorrectionNetwork
 from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.symmetry.reflections import UNKNOWN_OPACITY, penalty_offsets, with_reflections
 from hyperplanes.configuration.compatibility import check_model
@@ -68,6 +69,7 @@ class HyperPlanesNetwork(nn.Module):
             if config.learned_steps:
                 assert self.target.volume_size is not None  # `check_model`
                 self.learned_step = LearnedStep(self.target.volume_size[1], self.theta[GRID_WEIGHT].shape[0])
+            self.corrector = CorrectionNetwork() if config.learned_correction else None
         self.register_buffer("rig", torch.zeros(self.target.rig_size, 3))
 
     @property

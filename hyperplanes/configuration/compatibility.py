@@ -37,6 +37,8 @@ def check_model(config: ModelConfig) -> type[Target]:
         )
     if config.plane_dropout and (target.permutation_invariant or not target.reads_planes):
         raise ValueError(f"plane_dropout: expected a field with a fixed number of planes, got {config.target}")
+    if config.learned_correction and not config.residuals:
+        raise ValueError("learned_correction: expected residuals, which it is computed from, got none")
     for name in ("stacked", "hull_share", "gated", "average", "symmetric", "symmetry", "azimuth"):
         if getattr(config, name) and not target.permutation_invariant:
             raise ValueError(f"{name}: expected a field that takes any number of views, got {config.target}")

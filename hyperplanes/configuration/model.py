@@ -60,6 +60,8 @@ class ModelConfig:
             trains it after the model.
         residuals: whether pictures from three views or more, unless these are large, are corrected by the residuals of
             the views (`adaptation.correction.residuals`).
+        learned_correction: whether a network computes this correction (`correction.correction_network`);
+            `training.correction` trains it after the model.
         symmetric: whether reflections of the views of an object that looks symmetric are added to its views
             (`adaptation.symmetry.detection`). Not used in training.
         symmetry: of the object, if it is known.
@@ -83,6 +85,7 @@ class ModelConfig:
     average: float = 0.0
     learned_steps: Annotated[int, range(33)] = 0
     residuals: bool = False
+    learned_correction: bool = False
     symmetric: bool = False
     symmetry: Symmetry | None = None
     azimuth: float | None = None
@@ -120,7 +123,9 @@ class ModelConfig:
     def target_alone(self) -> ModelConfig:
         """The model of its target alone, without a network that finds weights and without averaged pictures."""
         alone = replace(self, hypernetwork=None, autoencoder=None, initialisation=None)
-        return replace(alone, stacked=False, hull_share=0.0, gated=False, average=0.0, learned_steps=0)
+        return replace(
+            alone, stacked=False, hull_share=0.0, gated=False, average=0.0, learned_steps=0, learned_correction=False
+        )
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""

@@ -101,14 +101,19 @@ def _begin_with(model: HyperPlanes, reference: Path, folder: Path) -> None:
 
 
 def _with_later_parts(config: ModelConfig, reference: Path) -> ModelConfig:
-    """The configuration with the learned steps and the gating network of a checkpoint, if its field is the same.
+    """The configuration with the parts of a checkpoint that were trained after it, if its field is the same.
 
     They were trained after the model, and no preset has them.
     """
     found = HyperPlanes.from_pretrained(reference).config
     if found.target != config.target:
         return config
-    return replace(config, learned_steps=config.learned_steps or found.learned_steps, gated=config.gated or found.gated)
+    return replace(
+        config,
+        learned_steps=config.learned_steps or found.learned_steps,
+        gated=config.gated or found.gated,
+        learned_correction=config.learned_correction or (config.residuals and found.learned_correction),
+    )
 
 
 def _goes_on(reference: Path, folder: Path) -> bool:

@@ -12,7 +12,7 @@ import torch
 
 from hyperplanes.adaptation import CorrectedField, HullBlend, HyperPlanes, ResidualField
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.correction import residuals
+from hyperplanes.adaptation.correction import correction_network, reprojection, residuals
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.optimisation.descent import Descent
 from hyperplanes.adaptation.swapped import Swapped
@@ -112,20 +112,22 @@ def test_corrected_pixels_agree_with_a_loop_over_the_views(name):
     plain, found = field.render(asked), ResidualField(field, support).render(asked).images[0]
     own, faint, outside, changed = field.render(support.cameras), 0, 0, 0
     for row, column in (
-        (plain.opacity[0, 0] > residuals.MIN_CORRECTED_OPACITY).nonzero().tolist()[:: 9 if name == "ball" else 6]
+        (plain.opacity[0, 0] > correction_network.MIN_CORRECTED_OPACITY)
+        .nonzero()
+        .tolist()[:: 9 if name == "ball" else 6]
     ):
         depth, opacity = (float(each[0, 0, row, column]) for each in (plain.depth, plain.opacity))
         if not depth:
             continue
         ray = cast(asked, torch.tensor([0]), torch.tensor([[column, row]]), support.bounds)
         point = ray.origins[0] + depth * ray.directions[0]
-        total, weights = torch.zeros(3), residuals.DOUBT
+        total, weights = torch.zeros(3), reprojection.DOUBT
         for view in range(len(support)):
             one = camera.select(support.cameras, [view])
             offset = point - camera.centres(one)[0].to(point)
             aside = 1 - float(offset @ ray.directions[0].to(offset) / offset.norm())
             x, y = one.project(point[None].to(one.extrinsics))[0].tolist()
-            if aside >= residuals.MAX_COSINE_DISTANCE:
+            if aside >= reprojection.MAX_COSINE_DISTANCE:
                 continue
             if not (0 <= x <= SIZE[1] - 1 and 0 <= y <= SIZE[0] - 1):
                 outside += 1
@@ -140,19 +142,20 @@ def test_corrected_pixels_agree_with_a_loop_over_the_views(name):
                 moment += part * float(own.depth[view, 0, at, along] * own.opacity[view, 0, at, along])
                 covered += part * float(own.opacity[view, 0, at, along])
             apart = (float(offset.norm()) - moment / max(covered, 1e-3)) / (
-                residuals.DISTANCE_SCALE * support.bounds.radius
+                reprojection.DISTANCE_SCALE * support.bounds.radius
             )
-            angular = math.exp(-residuals.ANGULAR_FALLOFF * aside) - math.exp(
-                -residuals.ANGULAR_FALLOFF * residuals.MAX_COSINE_DISTANCE
+            angular = math.exp(-reprojection.ANGULAR_FALLOFF * aside) - math.exp(
+                -reprojection.ANGULAR_FALLOFF * reprojection.MAX_COSINE_DISTANCE
             )
             weight = angular * math.exp(-(apart**2))
             total, weights = total + weight * lacking, weights + weight
         expected = (
-            plain.images[0, :, row, column] + min(1, opacity / residuals.FULL_CORRECTION_OPACITY) * total / weights
+            plain.images[0, :, row, column]
+            + min(1, opacity / correction_network.FULL_CORRECTION_OPACITY) * total / weights
         )
         torch.testing.assert_close(found[:, row, column], expected.clamp(0, 1), atol=1e-3, rtol=0)
         changed += bool((expected - plain.images[0, :, row, column]).abs().max() > 0.05)
-        faint += opacity < 0.8 * residuals.FULL_CORRECTION_OPACITY
+        faint += opacity < 0.8 * correction_network.FULL_CORRECTION_OPACITY
     assert changed > 5
     assert name == "ball" or (faint > 5 and outside > 5)
 

@@ -11,10 +11,8 @@ residual is computed with a penalty on it, as if it were as far away as support 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from threading import RLock
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,6 +20,14 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable, attributes_of
+from hyperplanes.adaptation.correction.correction_network import (
+    DEPTH_OFFSETS,
+    MIN_CORRECTED_OPACITY,
+    CorrectionNetwork,
+    covered,
+    readings,
+)
+from hyperplanes.adaptation.correction.reprojection import CHANNELS, Reprojected, are_near, reproject
 from hyperplanes.adaptation.network import HyperPlanesNetwork
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.chosen_views import PENALTY_RADIANS
@@ -30,6 +36,7 @@ from hyperplanes.geometry.rays import Rays, cast, pixel_grid
 from hyperplanes.rendering.compositing import Rendered
 from hyperplanes.rendering.refinement import RefinedOccupancy
 from hyperplanes.rendering.renderer import Sampler
+from hyperplanes.utilities.machine.locks import ForkSafeLock
 from hyperplanes.utilities.machine.memory import require_memory
 from hyperplanes.utilities.messages.arguments import checked
 from hyperplanes.utilities.tensors.precision import without_autocast
@@ -37,40 +44,38 @@ from hyperplanes.views import Views
 
 __all__ = ["CorrectedField", "ResidualField", "are_corrected", "corrected_field"]
 
-ANGULAR_FALLOFF = 10.0  # of weights as a function of 1 - the cosine of the angle between rays: a third at 27 degrees
-MAX_COSINE_DISTANCE = 0.5  # value of 1 - cosine from which on the weight is 0: 60 degrees
-DISTANCE_SCALE = 0.25  # distance from the surface that a support view sees, in radii, at which the weight is 1 / e
-DOUBT = 0.1  # weight of a residual of zero
 OWN_VIEW_ANGLE = 0.4  # radians that a support view counts as farther away when its own residual is computed
 MIN_CORRECTED_VIEWS = 3  # two gain 0.04 dB, one 0.01 (docs/image-based-measurements.md)
-MIN_CORRECTED_OPACITY = 0.01  # from which on a pixel is corrected in part
-FULL_CORRECTION_OPACITY = 1 / 3  # and in full
-PAIR_CHUNK = 1 << 18  # of a pixel and a support view, processed at once
 MAX_SUPPORT_PIXELS = 1 << 21  # of support views, such as 52 of 200x200, which take 20 s of two cores
 
-_rendering = RLock()  # so that two threads that need the same support views render them once
+_rendering = ForkSafeLock()  # so that two threads that need the same support views render them once
 
 
 class ResidualField:
     """A field with residual correction of its pictures; opacity and depth stay those of the field.
 
-    Support views near a new view are rendered on first use and kept, at 20 bytes a pixel.
+    Support views near a new view are rendered on first use and kept, at 32 bytes a pixel.
     """
 
-    def __init__(self, uncorrected: Renderable, views: Views) -> None:
+    def __init__(self, uncorrected: Renderable, views: Views, network: CorrectionNetwork | None = None) -> None:
         """A field and its support views.
 
         Args:
             uncorrected: the field.
             views: its support views, over the background that the field renders.
+            network: which computes the correction from what the support views show; without it, the mean of their
+                residuals is added.
         """
         count, (height, width) = len(views), views.size
-        needed = 20 * count * height * width
+        needed = 4 * CHANNELS * count * height * width
         require_memory("views", f"{count} of {width}x{height}", needed, "show fewer or smaller ones")
         self.uncorrected = uncorrected
         self.views = views
-        self._planes = ImagePlanes(views.images.new_zeros(count, 5, height, width), views.cameras, 0.0, exact=True)
-        self._known: set[int] = set()  # views with residual, depth times opacity, and opacity in the planes
+        self.network = network
+        self._planes = ImagePlanes(
+            views.images.new_zeros(count, CHANNELS, height, width), views.cameras, 0.0, exact=True
+        )
+        self._known: set[int] = set()  # views whose channels are computed
 
     def __repr__(self) -> str:
         return f"ResidualField({self.uncorrected!r}, {self.views!r})"
@@ -97,15 +102,57 @@ class ResidualField:
             pictures: of the field, one a camera.
             cameras: as in `render`.
         """
-        images, cameras = pictures.images.clone(), camera.to(cameras, pictures.images.device)
-        pixels = pixel_grid(*camera.image_size(cameras), images.device)
-        for view in range(len(images)):
-            opacity, depth = (each[view].flatten() for each in (pictures.opacity, pictures.depth))
-            seen = ((opacity > MIN_CORRECTED_OPACITY) & (depth > 0)).nonzero()[:, 0]
-            rays = cast(cameras, torch.full_like(seen, view), pixels[seen], self.views.bounds)
-            added = self._blended(rays.at(depth[seen].to(rays.directions)), rays.directions).to(images)
-            images[view].view(3, -1)[:, seen] += added.T * (opacity[seen] / FULL_CORRECTION_OPACITY).clamp(max=1)
-        return replace(pictures, images=images.clamp(0, 1))
+        images, cameras = pictures.images, camera.to(cameras, pictures.images.device)
+        added = [self._added(pictures, cameras, view) for view in range(len(images))]
+        return replace(pictures, images=(images + torch.stack(added).to(images)).clamp(0, 1) if added else images)
+
+    @torch.no_grad()
+    def readings(
+        self, pictures: Pictures, cameras: PinholeCamera, view: int
+    ) -> Float[Tensor, "21 height width"] | None:
+        """The inputs of a correction network for one of these pictures; None if it shows nothing of the scene.
+
+        Args:
+            pictures: of the field, one a camera.
+            cameras: as in `render`.
+            view: index of the picture.
+        """
+        seen, rays, depth = self._surface(pictures, cameras, view)
+        radius, centre = self.views.bounds.radius, rays.origins.new_tensor(self.views.bounds.centre)
+        offsets = radius * depth.new_tensor(DEPTH_OFFSETS)
+        points = torch.cat([rays.at(depth + offset) for offset in offsets])
+        found = self._reprojected(points, rays.directions.repeat(len(offsets), 1))
+        if found is None:
+            return None
+        middle = ((rays.at(depth) - centre) * rays.directions).sum(1) / radius
+        return readings(
+            pictures.images[view].to(points), pictures.opacity[view, 0].to(points), seen,
+            found.map(lambda values: values.unflatten(0, (len(offsets), -1))), middle, len(self.views),
+        )  # fmt: skip
+
+    def _added(self, pictures: Pictures, cameras: PinholeCamera, view: int) -> Float[Tensor, "3 height width"]:
+        """What is added to the colours of a picture."""
+        if self.network is not None:
+            read = self.readings(pictures, cameras, view)
+            weights = next(self.network.parameters())
+            return self.network(read[None].to(weights))[0] if read is not None else torch.zeros_like(pictures.images[0])
+        result = torch.zeros_like(pictures.images[view])
+        seen, rays, depth = self._surface(pictures, cameras, view)
+        found = self._reprojected(rays.at(depth), rays.directions)
+        if found is not None:
+            result[:, seen] = found.residual.T.to(result) * covered(pictures.opacity[view, 0][seen])
+        return result
+
+    def _surface(
+        self, pictures: Pictures, cameras: PinholeCamera, view: int
+    ) -> tuple[Bool[Tensor, "height width"], Rays, Float[Tensor, " pixel"]]:
+        """The pixels of a picture that are corrected, their rays, and their depths."""
+        opacity, depth = pictures.opacity[view, 0], pictures.depth[view, 0]
+        seen = (opacity > MIN_CORRECTED_OPACITY) & (depth > 0)
+        pixels = pixel_grid(*seen.shape, seen.device)[seen.flatten()]
+        rays = cast(cameras, torch.full((len(pixels),), view, device=seen.device), pixels, self.views.bounds)
+        rays = rays.to(self._planes.images.dtype)
+        return seen, rays, depth[seen].to(rays.directions)
 
     @torch.no_grad()
     def prepare(self, on_view: Callable[[int], None] | None = None) -> None:
@@ -119,39 +166,15 @@ class ResidualField:
             if on_view is not None:
                 on_view(view + 1)
 
-    def _blended(self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]) -> Tensor:
-        """The weighted mean of the residuals of support views at points seen along these directions."""
-        points, directions = points.to(self._planes.images), directions.to(self._planes.images)
-        size = max(1, PAIR_CHUNK // len(self.views))
-        parts = list(zip(points.split(size), directions.split(size), strict=True))
-        near = torch.zeros(len(self.views), dtype=torch.bool, device=points.device)
-        for part in parts:
-            near |= self._near(*part)
-        chosen = near.nonzero()[:, 0]
+    def _reprojected(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> Reprojected | None:
+        """What support views show at points seen along these directions; None if no view sees any of them."""
+        chosen = are_near(self._planes, points, directions).nonzero()[:, 0]
         if not len(chosen):
-            return torch.zeros_like(points)
+            return None
         self._compute(chosen.tolist())
-        blended = []
-        for places, along in parts:
-            found = self._planes.lookup(places, chosen.expand(len(places), -1), return_directions=True)
-            assert found.directions is not None
-            assert found.distances is not None
-            residual, moment, opacity = found.colours.split([3, 1, 1], -1)
-            apart = found.distances - (moment / opacity.clamp_min(1e-3)).squeeze(-1)
-            aside = 1 - (found.directions * along[:, None]).sum(-1)
-            weights = (
-                torch.exp(-ANGULAR_FALLOFF * aside) - math.exp(-ANGULAR_FALLOFF * MAX_COSINE_DISTANCE)
-            ).clamp_min(0)
-            # outside of an image opacity is 0, so the surface seems to be at the camera, and the weight is 0
-            weights = weights * torch.exp(-(apart / (DISTANCE_SCALE * self.views.bounds.radius)).square())
-            blended.append((weights[..., None] * residual).sum(1) / (weights.sum(1, keepdim=True) + DOUBT))
-        return torch.cat(blended)
-
-    def _near(self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]) -> Bool[Tensor, " view"]:
-        """The support views with a weight above 0 for any of the points."""
-        offsets = points[:, None] - camera.centres(self._planes.cameras).to(points)
-        cosines = (torch.nn.functional.normalize(offsets, dim=-1) * directions[:, None]).sum(-1)
-        return (1 - cosines < MAX_COSINE_DISTANCE).any(0)
+        return reproject(self._planes, chosen, points, directions, self.views.bounds.radius)
 
     def _beside(self, view: int) -> Renderable:
         """The field, which reads a support view as if it stood OWN_VIEW_ANGLE farther away."""
@@ -161,7 +184,7 @@ class ResidualField:
         return self.uncorrected.with_penalty_at(centre, OWN_VIEW_ANGLE / PENALTY_RADIANS)
 
     def _compute(self, chosen: list[int]) -> None:
-        """Computes residual, depth times opacity, and opacity of the chosen support views, unless done already.
+        """Computes the channels of the chosen support views, unless done already.
 
         One at a time: a picture depends a little on the others of its call (`AdaptedField.render`), and which views are
         missing depends on the pictures before.
@@ -171,8 +194,8 @@ class ResidualField:
                 if view in self._known:
                     continue
                 own = self._beside(view).render(camera.select(self._planes.cameras, [view]))
-                lacking = self.views.images[[view]].to(own.images) - own.images
-                maps = torch.cat([lacking, own.depth * own.opacity, own.opacity], 1)
+                image = self.views.images[[view]].to(own.images)
+                maps = torch.cat([image - own.images, own.depth * own.opacity, own.opacity, image], 1)
                 self._planes.images[view] = maps[0].to(self._planes.images)
                 self._known.add(view)
 
@@ -257,5 +280,5 @@ def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support:
     """
     if not are_corrected(network, support):
         return adapted
-    residuals = ResidualField(adapted, network.to_own(support))
+    residuals = ResidualField(adapted, network.to_own(support), network.corrector)
     return CorrectedField(**attributes_of(adapted), uncorrected=adapted, residuals=residuals)
