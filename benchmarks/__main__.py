@@ -18,6 +18,7 @@ NAMES = (
     "image_based",
     "busy",
     "captures",
+    "correction",
     "gating",
     "generation",
     "gpu",

@@ -183,8 +183,8 @@ def _measured(
         row |= {"seeds": len(tried)} if len(tried) > 1 else {}
         row |= {each: score.mean(each) for each in QUANTITIES if each in score.quantities}
         row["worst"] = min(each.psnr for each in score.objects)
-        uncorrected = "uncorrected" if method == "one_step" else f"{method}_uncorrected"
-        for reference in ("hull_blend", f"scratch_{method.removesuffix('_steps')}", uncorrected):
+        corrected = (name if method == "one_step" else f"{method}_{name}" for name in OF_CORRECTION)
+        for reference in ("hull_blend", f"scratch_{method.removesuffix('_steps')}", *corrected):
             row |= _above(score, scores[reference]) if reference in scores else {}
         scores[method] = score
         yield row
@@ -219,6 +219,9 @@ def suite_folders(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -
     return folders
 
 
+OF_CORRECTION = ("uncorrected", "residuals_alone")
+"""The methods without residual correction, and without the network that computes it."""
+
 SUITES: dict[str, dict[str, str]] = {
     "procedural": {
         f"{kind}s": f"--class {kind} --count 320 --held-out 20 --resolution 128 --rig random --seed 1300"
@@ -252,7 +255,7 @@ def _after_its_references(method: str) -> int:
     """A sort key for methods: those that others are compared with come first."""
     if method == "hull_blend":
         return 0
-    return 1 if method.startswith("scratch_") or method.endswith("uncorrected") else 2
+    return 1 if method.startswith("scratch_") or method.endswith(OF_CORRECTION) else 2
 
 
 def _above(score: Score, reference: Score) -> Row:
@@ -317,7 +320,10 @@ def adapters(
         settings = FineTuning(seed=seed)
         found[f"{each}_steps"] = tuned = FineTuned(model, each, settings)
         if "uncorrected" in wanted:
-            found[f"{each}_steps_uncorrected"] = FineTuned(_changed(model, residuals=False), each, settings)
+            found[f"{each}_steps_uncorrected"] = FineTuned(model.without_residuals(), each, settings)
+        if "residuals_alone" in wanted:
+            alone = _changed(model, learned_correction=False)
+            found[f"{each}_steps_residuals_alone"] = FineTuned(alone, each, settings)
         if "ungated" in wanted:
             found[f"{each}_steps_ungated"] = _Ungated(tuned)
         found[f"scratch_{each}"] = FromScratch(model, each, settings)
@@ -440,6 +446,7 @@ METHODS = {
     "unrotated": lambda model, *_: _Unrotated(model),
     "no_learned_steps": lambda model, *_: _changed(model, learned_steps=0),
     "one_ray": lambda model, *_: _Rendered(model, {"antialias": False}),
-    "uncorrected": lambda model, *_: _changed(model, residuals=False),
+    "uncorrected": lambda model, *_: model.without_residuals(),
+    "residuals_alone": lambda model, *_: _changed(model, learned_correction=False),
     "single_precision": lambda model, *_: _Rendered(model, {"mixed_precision": False}),
 }

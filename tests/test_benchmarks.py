@@ -183,9 +183,9 @@ def test_rows_of_speed_are_not_written_on_a_busy_machine(name, tmp_path, monkeyp
 def test_all_runs_every_benchmark_and_says_what_needs_data(tmp_path, monkeypatch, capsys):
     """Property: `all` runs every benchmark, with options that the benchmark has, and passes --under-load on.
 
-    `all`, `tables` and `gating` make no rows themselves.
+    `all`, `tables`, `gating` and `correction` make no rows themselves.
     """
-    ran, without_rows = [], {"all", "tables", "gating"}
+    ran, without_rows = [], {"all", "tables", "gating", "correction"}
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     run = types.SimpleNamespace(returncode=0)
     monkeypatch.setattr(subprocess, "run", lambda command, check, env: ran.append(command[3:]) or run)

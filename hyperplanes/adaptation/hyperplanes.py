@@ -55,7 +55,9 @@ class HyperPlanes(HyperPlanesNetwork):
 
     def without_residuals(self) -> Self:
         """A model with the same weights without residual correction of its pictures (`correction.residuals`)."""
-        return self._configured(residuals=False, learned_correction=False)
+        result = self._configured(residuals=False, learned_correction=False)
+        result.corrector = None
+        return result
 
     def _configured(self, **changes: Any) -> Self:
         """A model that shares the weights of this one and has another configuration."""
@@ -173,7 +175,7 @@ class HyperPlanes(HyperPlanesNetwork):
         beside = {"hull_share": learned.share, "gated": learned.gate is not None, "average": learned.average}
         azimuth = -adapted.rotation.angle if isinstance(adapted, RotatedField) else 0.0
         beside |= {
-            "learned_correction": self.corrector is not None,
+            "learned_correction": self.config.learned_correction,
             "symmetric": False,
             "symmetry": adapted.symmetry,
             "azimuth": azimuth,

@@ -12,7 +12,7 @@ from tests.reference_rendering import Balls
 
 
 def test_a_training_with_its_preset_begins_with_the_packaged_weights(tmp_path):
-    """All of them: also the gating network and the learned steps, which no preset has, and which are not trained."""
+    """Also the networks of gating, correction and learned steps, which no preset has or training changes."""
     packaged, chosen = find_checkpoint("small"), preset("small")
     training = replace(chosen.training, steps=1, views=(2,), rays=4, tasks=1, volume_loss=0.0)
     trainer = start_training(chosen.model, training, Balls(), tmp_path, reference=packaged)
@@ -23,7 +23,7 @@ def test_a_training_with_its_preset_begins_with_the_packaged_weights(tmp_path):
     trainer.take_step()
     changed = {name for name, value in trainer.model.state_dict().items() if not torch.equal(value, weights[name])}
     assert any(name.startswith("hypernetwork.") for name in changed)
-    assert not any(name.startswith(("gate.", "learned_step.")) for name in changed)
+    assert not any(name.startswith(("gate.", "learned_step.", "corrector.")) for name in changed)
 
 
 def test_the_preset_of_the_packaged_model_has_its_settings_of_views():

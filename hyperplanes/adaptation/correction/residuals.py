@@ -149,7 +149,8 @@ class ResidualField:
         """The pixels of a picture that are corrected, their rays, and their depths."""
         opacity, depth = pictures.opacity[view, 0], pictures.depth[view, 0]
         seen = (opacity > MIN_CORRECTED_OPACITY) & (depth > 0)
-        pixels = pixel_grid(*seen.shape, seen.device)[seen.flatten()]
+        height, width = seen.shape
+        pixels = pixel_grid(height, width, seen.device)[seen.flatten()]
         rays = cast(cameras, torch.full((len(pixels),), view, device=seen.device), pixels, self.views.bounds)
         rays = rays.to(self._planes.images.dtype)
         return seen, rays, depth[seen].to(rays.directions)
@@ -280,5 +281,6 @@ def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support:
     """
     if not are_corrected(network, support):
         return adapted
-    residuals = ResidualField(adapted, network.to_own(support), network.corrector)
+    corrector = network.corrector if network.config.learned_correction else None
+    residuals = ResidualField(adapted, network.to_own(support), corrector)
     return CorrectedField(**attributes_of(adapted), uncorrected=adapted, residuals=residuals)

@@ -1,0 +1,207 @@
+"""Sources of truth: a textured ball whose depth is known, and examples in which it is known what has to be added."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hyperplanes.adaptation import CorrectedField, HyperPlanes, ResidualField
+from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.correction import correction_network
+from hyperplanes.adaptation.correction.correction_network import (
+    CANDIDATES,
+    DEPTH_OFFSETS,
+    MIN_CORRECTED_OPACITY,
+    OPACITY,
+    READINGS,
+    CorrectionNetwork,
+)
+from hyperplanes.geometry import cameras as camera
+from hyperplanes.geometry.occupancy import full
+from hyperplanes.geometry.rays import Sphere
+from hyperplanes.rendering import RayMarching
+from hyperplanes.training.correction import CorrectionExample, disturbed, example_of, fit_correction
+from hyperplanes.views import Views
+from tests.adaptation import test_stacking
+from tests.reference_rendering import Balls, ball_views, camera_at, ring
+
+SIZE = (48, 48)
+OFFSET = 18  # of the inputs: the depth at which the support views agree
+
+
+def striped(radius, contrast=0.4):
+    """An opaque ball with stripes, which are the same at all depths."""
+
+    def field(points, directions):
+        along = torch.nn.functional.normalize(points, dim=-1)
+        stripes = 0.5 + contrast * torch.sin(15 * along[:, :1] + along.new_tensor([0.0, 1.0, 2.0])) * torch.cos(
+            6 * along[:, 1:2]
+        )
+        return stripes, 400.0 * (points.norm(dim=-1) < radius)
+
+    return AdaptedField(field, full(Sphere(), 32), RayMarching(96, 0.02))
+
+
+def views_of(field, cameras):
+    return Views(field.render(cameras).images, cameras, None, Sphere())
+
+
+@pytest.fixture(scope="module")
+def deep():
+    """A grey ball that is too small by one depth offset, and views of the striped ball that it should be."""
+    aside = [math.radians(degrees) for degrees in (20, 30, 40, 50)]  # all on one side, so that errors do not cancel
+    cameras = camera.concatenate([camera_at((3 * math.sin(each), 0.0, 3 * math.cos(each)), SIZE) for each in aside])
+    support, asked = views_of(striped(0.6), cameras), camera_at((0.0, 0.0, 3.0), SIZE)
+    return striped(0.6 + DEPTH_OFFSETS[1], 0.0), support, views_of(striped(0.6), asked)
+
+
+def learned(seed=0):
+    """A network with random weights."""
+    network = CorrectionNetwork()
+    generator = torch.Generator().manual_seed(seed)
+    for weights in network.parameters():
+        weights.copy_(0.1 * torch.randn(weights.shape, generator=generator))
+    return network
+
+
+def test_support_views_agree_at_the_true_depth_and_residuals_from_there_are_better(deep):
+    wrong, support, query = deep
+    pictures = wrong.render(query.cameras)
+    read = ResidualField(wrong, support).readings(pictures, query.cameras, 0)
+    inside = torch.zeros(SIZE, dtype=torch.bool)
+    inside[20:28, 20:28] = True  # where the surface is hardly inclined
+    assert float(read[OFFSET][inside].median()) == pytest.approx(10 * DEPTH_OFFSETS[1], abs=0.15)
+    true = striped(0.6, 0.0)
+    again = ResidualField(true, support).readings(true.render(query.cameras), query.cameras, 0)
+    assert abs(float(again[OFFSET][inside].median())) < 0.1
+    errors = [
+        (ResidualField(wrong, support, network).render(query.cameras).images - query.images)[0, :, inside]
+        .square()
+        .mean()
+        for network in (None, CorrectionNetwork())
+    ]
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_an_untrained_network_adds_the_residuals_at_the_best_depths(deep):
+    wrong, support, query = deep
+    pictures, residuals = wrong.render(query.cameras), ResidualField(wrong, support, CorrectionNetwork())
+    read = residuals.readings(pictures, query.cameras, 0)
+    expected = pictures.images[0] + read[CANDIDATES][3:6] * (read[OPACITY] > MIN_CORRECTED_OPACITY)
+    torch.testing.assert_close(residuals.correct(pictures, query.cameras).images[0], expected.clamp(0, 1))
+
+
+def test_the_first_candidate_is_the_correction_without_a_network(deep):
+    wrong, support, query = deep
+    pictures, residuals = wrong.render(query.cameras), ResidualField(wrong, support)
+    read = residuals.readings(pictures, query.cameras, 0)
+    expected = (pictures.images[0] + read[CANDIDATES][:3]).clamp(0, 1)
+    torch.testing.assert_close(residuals.correct(pictures, query.cameras).images[0], expected, atol=1e-5, rtol=0)
+
+
+def test_only_the_rectangle_around_the_object_is_computed(monkeypatch):
+    """It gives what the whole picture gives, also for several pictures at once."""
+    read = torch.rand(2, READINGS, 40, 50, generator=torch.Generator().manual_seed(0))
+    read[:, OPACITY] = 0.0
+    read[0, OPACITY, 15:20, 20:28], read[1, OPACITY, 17:22, 0:9] = 0.6, 0.3
+    network = learned()
+    found = network(read)
+    assert torch.equal(found[:, :, :15], torch.zeros(2, 3, 15, 50))
+    monkeypatch.setattr(correction_network, "_box", lambda seen: (slice(None), slice(None)))
+    torch.testing.assert_close(found, network(read))
+    assert found[0, :, 15:20, 20:28].abs().min() > 0
+
+
+def test_pictures_that_no_support_view_shows_stay(deep):
+    wrong, support, query = deep
+    behind = camera.look_at(-camera.centres(query.cameras).float(), (0.0, 0.0, 0.0))
+    other_side = views_of(striped(0.6), camera.pinhole(camera.symmetric_intrinsics(*SIZE, 0.8), behind, *SIZE))
+    away = camera_at((0.0, 0.0, 3.0), SIZE, target=(0.0, 0.0, 9.0))
+    for cameras, views in ((away, support), (query.cameras, other_side)):
+        residuals, plain = ResidualField(wrong, views, learned()), wrong.render(cameras)
+        assert residuals.readings(plain, cameras, 0) is None
+        assert torch.equal(residuals.correct(plain, cameras).images, plain.images.clamp(0, 1))
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A model whose correction network has random weights."""
+    config = replace(test_stacking.CONFIG, stacked=False, residuals=True, learned_correction=True)
+    made = HyperPlanes(config)
+    made.load_state_dict(test_stacking.model().state_dict(), strict=False)
+    made.corrector = learned()
+    return made.eval()
+
+
+@pytest.fixture(scope="module")
+def many():
+    return ball_views(ring(6, (24, 24)))
+
+
+def test_a_model_corrects_its_pictures_by_its_network(model, many, tmp_path):
+    asked = ring(2, (24, 24), shift=1)
+    field = model.adapt(many)
+    assert isinstance(field, CorrectedField)
+    found, plain = field.render(asked).images, field.without_residuals()
+    assert torch.equal(found, ResidualField(plain, many, model.corrector).render(asked).images)
+    assert not torch.equal(found, ResidualField(plain, many).render(asked).images)
+    alone = model.with_weights_of(field)
+    torch.testing.assert_close(alone.adapt(many).render(asked).images, found)
+    model.save(tmp_path / "saved")
+    torch.testing.assert_close(HyperPlanes.from_pretrained(tmp_path / "saved").adapt(many).render(asked).images, found)
+    without = model.without_residuals()
+    without.save(tmp_path / "without")
+    assert HyperPlanes.from_pretrained(tmp_path / "without").corrector is None
+    assert model.corrector is not None
+    assert model.double().adapt(many).render(asked).images.isfinite().all()
+    model.float()
+
+
+def test_a_correction_network_without_residuals_is_refused():
+    with pytest.raises(ValueError, match="learned_correction: expected residuals"):
+        HyperPlanes(replace(test_stacking.CONFIG, learned_correction=True))
+
+
+def test_training_finds_which_candidate_is_right_and_where():
+    """In dark pixels the third candidate is right, in bright ones a quarter of the first: 0.1 and 0.05 are left."""
+    generator = torch.Generator().manual_seed(0)
+
+    def example():
+        read = 0.2 * torch.randn(2, READINGS, 16, 16, generator=generator)
+        read[:, OPACITY] = 1.0
+        dark = (torch.rand(2, 1, 16, 16, generator=generator) < 0.5).float()
+        read[:, :3] = 0.2 - 0.4 * dark
+        added = dark * read[:, 9:12] + (1 - dark) * read[:, 3:6] / 4
+        return CorrectionExample(read.half(), read[:, :3] + 0.5 + added)
+
+    gains = []
+    network = fit_correction([example() for _ in range(8)], steps=100, on_step=lambda _, gain: gains.append(gain))
+    assert gains[-1] > gains[0] + 10
+    test = example()
+    error = (test.read[:, :3].float() + 0.5 + network(test.read.float()) - test.truth).square().mean().sqrt()
+    assert error < 0.03
+    assert not any(weights.requires_grad for weights in network.parameters())
+
+
+def test_examples_are_the_readings_of_the_query_views(model):
+    task = Balls(views=6, size=(24, 24)).task("train0")
+    example = example_of(model, task)
+    assert example.read.shape == (len(task.query), READINGS, 24, 24)
+    assert torch.equal(example.truth, task.query.images)
+    pictures = model.adapt(task.support).without_residuals().render(task.query.cameras)
+    torch.testing.assert_close(example.read[:, :3].float(), pictures.images - 0.5, atol=1e-3, rtol=0)
+    tuned = example_of(model, task, 2)
+    assert not torch.equal(tuned.read, example.read)
+    with pytest.raises(ValueError, match="expected at least one"):
+        fit_correction([])
+
+
+def test_disturbed_cameras_are_rotated_by_the_angle_and_moved(many):
+    found = disturbed(many, 2.0, torch.Generator().manual_seed(0))
+    before, after = (each.cameras.rotation_matrix.double() for each in (many, found))
+    cosines = ((before @ after.mT).diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    torch.testing.assert_close(cosines.acos().rad2deg(), torch.full((6,), 2.0).double(), atol=1e-2, rtol=0)
+    moved = found.cameras.translation_vector - after.to(before) @ before.mT @ many.cameras.translation_vector.double()
+    assert 0.01 < float(moved.norm(dim=1).mean()) < 0.12
+    assert torch.equal(found.images, many.images)
