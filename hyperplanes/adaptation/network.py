@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from hyperplanes.adaptation.base import AdaptedField, hull
 from hyperplanes.adaptation.context import SupportContext, live_pixels, observe
-from hyperplanes.adaptation.correction.correction_network import CorrectionNetwork
+from hyperplanes.adaptation.correction_network import CorrectionNetwork
 from hyperplanes.adaptation.gating import GatingNetwork
 from hyperplanes.adaptation.symmetry.reflections import UNKNOWN_OPACITY, penalty_offsets, with_reflections
 from hyperplanes.configuration.compatibility import check_model

@@ -60,7 +60,7 @@ class ModelConfig:
             trains it after the model.
         residuals: whether pictures from three views or more, unless these are large, are corrected by the residuals of
             the views (`adaptation.correction.residuals`).
-        learned_correction: whether a network computes this correction (`correction.correction_network`);
+        learned_correction: whether a network computes this correction (`adaptation.correction_network`);
             `training.correction` trains it after the model.
         symmetric: whether reflections of the views of an object that looks symmetric are added to its views
             (`adaptation.symmetry.detection`). Not used in training.

@@ -11,8 +11,8 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from hyperplanes.adaptation.correction.correction_network import COLOUR, OPACITY, CorrectionNetwork
 from hyperplanes.adaptation.correction.residuals import ResidualField
+from hyperplanes.adaptation.correction_network import COLOUR, OPACITY, CorrectionNetwork
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.utilities.tensors.seeding import seeded
 from hyperplanes.views import Task, Views

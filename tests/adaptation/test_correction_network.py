@@ -6,10 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hyperplanes.adaptation import CorrectedField, HyperPlanes, ResidualField
+from hyperplanes.adaptation import CorrectedField, HyperPlanes, ResidualField, correction_network
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.correction import correction_network
-from hyperplanes.adaptation.correction.correction_network import (
+from hyperplanes.adaptation.correction_network import (
     CANDIDATES,
     DEPTH_OFFSETS,
     MIN_CORRECTED_OPACITY,

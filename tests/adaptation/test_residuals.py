@@ -10,9 +10,16 @@ from threading import Thread
 import pytest
 import torch
 
-from hyperplanes.adaptation import CorrectedField, HullBlend, HyperPlanes, ResidualField
+from hyperplanes.adaptation import (
+    CorrectedField,
+    HullBlend,
+    HyperPlanes,
+    ResidualField,
+    correction_network,
+    reprojection,
+)
 from hyperplanes.adaptation.base import AdaptedField
-from hyperplanes.adaptation.correction import correction_network, reprojection, residuals
+from hyperplanes.adaptation.correction import residuals
 from hyperplanes.adaptation.fine_tuned import FineTuned, FromScratch
 from hyperplanes.adaptation.optimisation.descent import Descent
 from hyperplanes.adaptation.swapped import Swapped

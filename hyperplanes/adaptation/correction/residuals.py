@@ -20,15 +20,15 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable, attributes_of
-from hyperplanes.adaptation.correction.correction_network import (
+from hyperplanes.adaptation.correction_network import (
     DEPTH_OFFSETS,
     MIN_CORRECTED_OPACITY,
     CorrectionNetwork,
     covered,
     readings,
 )
-from hyperplanes.adaptation.correction.reprojection import CHANNELS, Reprojected, are_near, reproject
 from hyperplanes.adaptation.network import HyperPlanesNetwork
+from hyperplanes.adaptation.reprojection import CHANNELS, Reprojected, are_near, reproject
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.chosen_views import PENALTY_RADIANS
 from hyperplanes.geometry.image_planes import ImagePlanes

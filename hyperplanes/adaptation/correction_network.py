@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hyperplanes.adaptation.correction.reprojection import DOUBT, Reprojected
+from hyperplanes.adaptation.reprojection import DOUBT, Reprojected
 
 __all__ = ["DEPTH_OFFSETS", "MIN_CORRECTED_OPACITY", "READINGS", "CorrectionNetwork", "covered", "readings"]
 
