@@ -20,6 +20,7 @@ ANGULAR_FALLOFF = 10.0  # of weights as a function of 1 - the cosine of the angl
 MAX_COSINE_DISTANCE = 0.5  # value of 1 - cosine from which on the weight is 0: 60 degrees
 DISTANCE_SCALE = 0.25  # distance from the surface that a support view sees, in radii, at which the weight is 1 / e
 DOUBT = 0.1  # weight of a residual of zero
+MIN_WEIGHT = 1e-6  # of all views together, below which means are 0
 PAIR_CHUNK = 1 << 18  # of a point and a support view, processed at once
 
 
@@ -87,31 +88,24 @@ def _reproject(planes: ImagePlanes, chosen: Tensor, points: Tensor, directions: 
     aside = 1 - (found.directions * directions[:, None]).sum(-1)
     least = math.exp(-ANGULAR_FALLOFF * MAX_COSINE_DISTANCE)
     weights = (torch.exp(-ANGULAR_FALLOFF * aside) - least).clamp_min(0)
-    weights = (weights * torch.exp(-(apart / DISTANCE_SCALE).square()))[..., None]
-    total = weights.sum(1)
-    relative = weights / total[:, None].clamp_min(1e-6)
-
-    def mean(values: Tensor) -> Tensor:
-        return (relative * values).sum(1)
-
-    def variance(values: Tensor) -> Tensor:
-        return mean((values - mean(values)[:, None]).square().mean(-1, keepdim=True))
-
-    return Reprojected(
-        residual=(weights * residual).sum(1) / (total + DOUBT),
-        image=mean(image),
-        weight=total,
-        largest=weights.amax(1),
-        distance=mean(apart[..., None]),
-        residual_variance=variance(residual),
-        image_variance=variance(image),
-    )
+    weights = (weights * torch.exp(-(apart / DISTANCE_SCALE).square()))[:, None]
+    squares = (each.square().mean(-1, keepdim=True) for each in (residual, image))
+    sums = (weights @ torch.cat([residual, image, apart[..., None], *squares], -1))[:, 0]
+    total = weights.sum(-1)
+    means = sums / total.clamp_min(MIN_WEIGHT)
+    of_residuals, of_images, distance, *squared = means.split([3, 3, 1, 1, 1], -1)
+    variances = [
+        (square - mean.square().mean(-1, keepdim=True)).clamp_min(0)
+        for square, mean in zip(squared, (of_residuals, of_images), strict=True)
+    ]
+    added = sums[:, :3] / (total + DOUBT)
+    return Reprojected(added, of_images, total, weights.amax(-1), distance, *variances)
 
 
 def are_near(
     planes: ImagePlanes, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
 ) -> Bool[Tensor, " view"]:
-    """The support views that may have a weight above 0 for any of the points.
+    """The support views that may have a weight above 0 for any of the points, or of those before them on their rays.
 
     Args:
         planes: of the support views.

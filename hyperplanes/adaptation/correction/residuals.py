@@ -119,15 +119,14 @@ class ResidualField:
         """
         seen, rays, depth = self._surface(pictures, cameras, view)
         radius, centre = self.views.bounds.radius, rays.origins.new_tensor(self.views.bounds.centre)
-        offsets = radius * depth.new_tensor(DEPTH_OFFSETS)
-        points = torch.cat([rays.at(depth + offset) for offset in offsets])
-        found = self._reprojected(points, rays.directions.repeat(len(offsets), 1))
+        points = torch.stack([rays.at(depth + radius * offset) for offset in DEPTH_OFFSETS])
+        found = self._reprojected(points, rays.directions)
         if found is None:
             return None
         middle = ((rays.at(depth) - centre) * rays.directions).sum(1) / radius
         return readings(
-            pictures.images[view].to(points), pictures.opacity[view, 0].to(points), seen,
-            found.map(lambda values: values.unflatten(0, (len(offsets), -1))), middle, len(self.views),
+            pictures.images[view].to(depth), pictures.opacity[view, 0].to(depth), seen,
+            found, middle, len(self.views),
         )  # fmt: skip
 
     def _added(self, pictures: Pictures, cameras: PinholeCamera, view: int) -> Float[Tensor, "3 height width"]:
@@ -168,14 +167,22 @@ class ResidualField:
                 on_view(view + 1)
 
     def _reprojected(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+        self, points: Float[Tensor, "*depth pixel 3"], directions: Float[Tensor, "pixel 3"]
     ) -> Reprojected | None:
-        """What support views show at points seen along these directions; None if no view sees any of them."""
-        chosen = are_near(self._planes, points, directions).nonzero()[:, 0]
+        """What support views show at points seen along these directions; None if no view sees any of them.
+
+        Args:
+            points: one or several of each ray, the farthest last.
+            directions: of the rays.
+        """
+        farthest = points[-1] if points.dim() > 2 else points
+        chosen = are_near(self._planes, farthest, directions).nonzero()[:, 0]
         if not len(chosen):
             return None
         self._compute(chosen.tolist())
-        return reproject(self._planes, chosen, points, directions, self.views.bounds.radius)
+        along = directions.expand_as(points).flatten(0, -2)
+        found = reproject(self._planes, chosen, points.flatten(0, -2), along, self.views.bounds.radius)
+        return found.map(lambda values: values.view(*points.shape[:-1], -1))
 
     def _beside(self, view: int) -> Renderable:
         """The field, which reads a support view as if it stood OWN_VIEW_ANGLE farther away."""
