@@ -4,8 +4,9 @@
 
 Each held-out object gives one example of a random number of views: every third one after 100 gradient steps, the others
 after one forward pass, and every fourth one with small errors of its camera poses. The objects must be neither in the
-training data of the model nor in any table of results. The result is a copy of the model with the correction network.
-`python -m benchmarks views --methods uncorrected residuals_alone` measures its effect.
+training data of the model nor in any table of results. If the model has a correction network, the training continues
+from that. The result is a copy of the model with the correction network. `python -m benchmarks views --methods
+uncorrected residuals_alone` measures its effect.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def main(arguments: list[str]) -> int:
         if step % 100 == 0:
             print(f"step {step} of {chosen.steps}: {gain:+.2f} dB", flush=True)
 
-    network = fit_correction(examples, steps=1 if chosen.quick else chosen.steps, on_step=report)
+    network = fit_correction(examples, steps=1 if chosen.quick else chosen.steps, start=model.corrector, on_step=report)
     result = HyperPlanes(replace(model.config, residuals=True, learned_correction=True))
     result.load_state_dict(
         {**model.state_dict(), **{f"corrector.{name}": value for name, value in network.state_dict().items()}}

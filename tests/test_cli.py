@@ -31,6 +31,7 @@ from small_packaged import small_packaged
 from data_gen.rendering.renderers import RendererError
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView, ResidualField
 from hyperplanes.adaptation.checkpoints import find_checkpoint, find_checkpoints
+from hyperplanes.adaptation.correction import residuals
 from hyperplanes.cli import main
 from hyperplanes.commands import adapt, find_verb, find_verbs, parsing, render, split_settings
 from hyperplanes.commands.inputs.scene import read_scene
@@ -753,6 +754,9 @@ def test_pictures_of_many_views_are_corrected_unless_that_is_off(tmp_path, monke
     with small_packaged(learned_steps=0):
         assert main(["render", *command, "--out", str(tmp_path / "corrected")]) == 0
         assert "2 pictures (colours corrected by residuals)" in capsys.readouterr().out
+        with monkeypatch.context() as patch:  # on request also those of large views, by the same network
+            patch.setattr(residuals, "MAX_SUPPORT_PIXELS", 0)
+            assert main(["render", *command, "--out", str(tmp_path / "asked"), "--residuals", "on"]) == 0
         # without correction no support view is rendered: for pictures, for their estimated PSNR, or for voxels
         monkeypatch.setattr(ResidualField, "_compute", lambda *_: pytest.fail("a support view was rendered"))
         assert main(["render", *command, "--out", str(tmp_path / "plain"), "--residuals", "off"]) == 0
@@ -765,8 +769,9 @@ def test_pictures_of_many_views_are_corrected_unless_that_is_off(tmp_path, monke
         assert main(["bake", *command, *voxels]) == 0
         assert main(["export", *command, "--out", str(tmp_path / "export"), "--what", "points"]) == 0
         assert "corrected by residuals" not in capsys.readouterr().out
-    corrected, plain = (sorted((tmp_path / name).glob("*.png")) for name in ("corrected", "plain"))
+    corrected, asked, plain = (sorted((tmp_path / name).glob("*.png")) for name in ("corrected", "asked", "plain"))
     assert len(corrected) == len(plain) == 2
+    assert max(abs(pixels(one) - pixels(other)).max() for one, other in zip(corrected, asked, strict=True)) <= 1
     assert max(abs(pixels(one) - pixels(other)).max() for one, other in zip(corrected, plain, strict=True)) > 5
 
 

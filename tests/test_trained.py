@@ -17,6 +17,7 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes, ResidualField, diagno
 from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.correction import residuals
 from hyperplanes.adaptation.correction.stacking import StackedField
+from hyperplanes.adaptation.correction_network import CorrectionNetwork
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.optimisation import learned_steps
 from hyperplanes.adaptation.optimisation.descent import LEAST, contrast, draw_pixels
@@ -445,6 +446,34 @@ def test_residuals_raise_psnr_and_residuals_of_shuffled_views_lower_it(monkeypat
     assert wrong < plain - 5
     monkeypatch.setattr(residuals, "OWN_VIEW_ANGLE", 0.0)
     assert corrected > quality(ResidualField(field, support), shape()) + 0.04
+
+
+def test_the_correction_network_raises_psnr_because_of_what_it_reads(monkeypatch):
+    """Its weights, the support views at several depths, and what it reads besides the candidates."""
+    field, support, network = composition(25), shape().support, HyperPlanes.from_pretrained("small").corrector
+
+    def score(chosen=network):
+        return quality(ResidualField(field, support, chosen), shape())
+
+    whole, alone, untrained = score(), score(None), score(CorrectionNetwork())
+    print(whole, alone, untrained)
+    assert whole > alone + 0.3
+    assert whole > untrained + 0.2
+    with monkeypatch.context() as patch:
+        forward = CorrectionNetwork.forward
+        for hidden in (slice(13, 15), slice(12)):
+            patch.setattr(
+                CorrectionNetwork, "forward", lambda own, read, hidden=hidden: forward(own, shuffled(read, hidden))
+            )
+            print(score())
+
+
+def shuffled(read, inputs):
+    """Inputs of a correction network, of which some are those of other pixels."""
+    order = torch.randperm(read[0, 0].numel(), generator=torch.Generator().manual_seed(0))
+    read = read.clone()
+    read[:, inputs] = read[:, inputs].flatten(2)[:, :, order].unflatten(2, read.shape[2:])
+    return read
 
 
 def test_residuals_of_three_views_raise_psnr():

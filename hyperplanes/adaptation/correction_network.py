@@ -15,7 +15,7 @@ __all__ = ["DEPTH_OFFSETS", "MIN_CORRECTED_OPACITY", "READINGS", "CorrectionNetw
 DEPTH_OFFSETS = (-0.06, -0.03, 0.0, 0.03, 0.06)
 """Distances of the points of a ray from the surface of the field, in radii, at which support views are compared."""
 
-READINGS = 21  # inputs for a pixel
+READINGS = 16  # inputs for a pixel
 COLOUR, CANDIDATES, OPACITY = slice(3), slice(3, 12), slice(12, 13)  # of the inputs
 INITIAL_WEIGHTS = (0.0, 1.0, 0.0)  # of the candidates
 WIDTH, BLOCKS = 32, 2  # channels, and residual blocks of two convolutions each
@@ -38,7 +38,6 @@ def readings(
     opacity: Float[Tensor, "height width"],
     seen: Bool[Tensor, "height width"],
     found: Reprojected,
-    middle: Float[Tensor, " pixel"],
     views: int,
 ) -> Float[Tensor, "reading height width"]:
     """The inputs of the network for one picture.
@@ -52,7 +51,6 @@ def readings(
         opacity: of the field.
         seen: the pixels that are corrected.
         found: what support views show at each of DEPTH_OFFSETS of these pixels, (offset, pixel, value).
-        middle: distance of the surface from the centre of the scene along the ray, in radii.
         views: number of support views.
     """
     offsets = found.weight.new_tensor(DEPTH_OFFSETS)[:, None, None]
@@ -66,13 +64,8 @@ def readings(
         part * best.residual,
         part * (best.image - colours) * best.weight / (best.weight + DOUBT),
         opacity[seen][:, None],
-        best.weight.log1p(),
         best.residual_variance.sqrt(),
         best.image_variance.sqrt(),
-        best.largest,
-        best.distance,
-        10 * (likelihood * offsets).sum(0),
-        middle[:, None],
         torch.full_like(best.weight, math.log2(views) / 5),
     ]
     result = image.new_zeros(READINGS, *image.shape[1:])
@@ -119,7 +112,7 @@ class CorrectionNetwork(nn.Module):
         self.last = nn.Sequential(nn.ReLU(), last)
         self.requires_grad_(requires_grad=False)
 
-    def forward(self, read: Float[Tensor, "view 21 height width"]) -> Float[Tensor, "view 3 height width"]:
+    def forward(self, read: Float[Tensor, "view 16 height width"]) -> Float[Tensor, "view 3 height width"]:
         """What is added to the colours of pictures; 0 where they are not corrected.
 
         Args:

@@ -32,8 +32,6 @@ class Reprojected:
         residual: mean with a residual of zero of weight DOUBT.
         image: mean of the colours of the images; 0 where no view has a weight.
         weight: sum of the weights.
-        largest: the largest weight, at most 1.
-        distance: mean distance from the surface that a view sees, in radii.
         residual_variance: of the residuals, mean over the channels.
         image_variance: of the colours of the images, mean over the channels.
     """
@@ -41,8 +39,6 @@ class Reprojected:
     residual: Float[Tensor, "*point 3"]
     image: Float[Tensor, "*point 3"]
     weight: Float[Tensor, "*point 1"]
-    largest: Float[Tensor, "*point 1"]
-    distance: Float[Tensor, "*point 1"]
     residual_variance: Float[Tensor, "*point 1"]
     image_variance: Float[Tensor, "*point 1"]
 
@@ -90,16 +86,16 @@ def _reproject(planes: ImagePlanes, chosen: Tensor, points: Tensor, directions: 
     weights = (torch.exp(-ANGULAR_FALLOFF * aside) - least).clamp_min(0)
     weights = (weights * torch.exp(-(apart / DISTANCE_SCALE).square()))[:, None]
     squares = (each.square().mean(-1, keepdim=True) for each in (residual, image))
-    sums = (weights @ torch.cat([residual, image, apart[..., None], *squares], -1))[:, 0]
+    sums = (weights @ torch.cat([residual, image, *squares], -1))[:, 0]
     total = weights.sum(-1)
     means = sums / total.clamp_min(MIN_WEIGHT)
-    of_residuals, of_images, distance, *squared = means.split([3, 3, 1, 1, 1], -1)
+    of_residuals, of_images, *squared = means.split([3, 3, 1, 1], -1)
     variances = [
         (square - mean.square().mean(-1, keepdim=True)).clamp_min(0)
         for square, mean in zip(squared, (of_residuals, of_images), strict=True)
     ]
     added = sums[:, :3] / (total + DOUBT)
-    return Reprojected(added, of_images, total, weights.amax(-1), distance, *variances)
+    return Reprojected(added, of_images, total, *variances)
 
 
 def are_near(

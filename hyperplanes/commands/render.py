@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
     from hyperplanes.adaptation.base import Renderable
+    from hyperplanes.adaptation.correction_network import CorrectionNetwork
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.export.animation import Representation
     from hyperplanes.rendering.images import Pictures
@@ -142,7 +143,8 @@ def run(arguments: Arguments) -> int:
     if isinstance(source, HyperPlanes) and (arguments.residuals == "off" or arguments.protocol != "default"):
         source = source.without_residuals()
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
-    field, corrected = _drawn(arguments, field, shown, asked, console)
+    network = source.corrector if isinstance(source, HyperPlanes) else None
+    field, corrected = _drawn(arguments, field, shown, asked, network, console)
     started = time.perf_counter()
     pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / asked.cameras.batch_size
@@ -172,9 +174,18 @@ def run(arguments: Arguments) -> int:
 
 
 def _drawn(
-    arguments: Arguments, field: Renderable, shown: Views, asked: Asked, console: Console
+    arguments: Arguments,
+    field: Renderable,
+    shown: Views,
+    asked: Asked,
+    network: CorrectionNetwork | None,
+    console: Console,
 ) -> tuple[Renderable, bool]:
-    """The field, or its voxels, with residuals if requested, and whether there are residuals."""
+    """The field, or its voxels, with residuals if requested, and whether there are residuals.
+
+    The network computes the correction of a field; that of voxels is the mean residual.
+    """
+    from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.adaptation.correction.residuals import CorrectedField, ResidualField
     from hyperplanes.export.animation import choose_representation
     from hyperplanes.export.voxel_fitting import VOXEL_STEPS
@@ -182,7 +193,7 @@ def _drawn(
     make = partial(bake_field, fit=VOXEL_STEPS, console=console)
     field = choose_representation(field, shown, asked.cameras, _representation(arguments, asked), make=make)
     if arguments.residuals == "on" and not isinstance(field, CorrectedField):
-        field = ResidualField(field, shown)
+        field = ResidualField(field, shown, network if isinstance(field, AdaptedField) else None)
     residuals = field.residuals if isinstance(field, CorrectedField) else field
     if not isinstance(residuals, ResidualField):
         return field, False

@@ -36,7 +36,7 @@ class CorrectionExample:
         truth: the true pictures.
     """
 
-    read: Float[Tensor, "view 21 height width"]
+    read: Float[Tensor, "view 16 height width"]
     truth: Float[Tensor, "view 3 height width"]
 
 
@@ -77,6 +77,7 @@ def fit_correction(
     examples: Sequence[CorrectionExample],
     *,
     steps: int = CORRECTION_STEPS,
+    start: CorrectionNetwork | None = None,
     on_step: Callable[[int, float], None] | None = None,
 ) -> CorrectionNetwork:
     """Train a correction network with AdamW on the PSNR of parts of pictures, which are rotated and mirrored randomly.
@@ -84,6 +85,7 @@ def fit_correction(
     Args:
         examples: examples of objects, with all numbers of support views.
         steps: number of steps, each on PICTURES_PER_STEP random pictures.
+        start: a network that the training continues from; by default random weights.
         on_step: called with the number of steps done, and how many decibels the pictures of the last step are better
             than without correction.
 
@@ -94,6 +96,8 @@ def fit_correction(
         raise ValueError("examples: expected at least one, got none")
     with seeded(SEED):
         network = CorrectionNetwork().requires_grad_()
+    if start is not None:
+        network.load_state_dict(start.state_dict())
     descent = torch.optim.AdamW(network.parameters(), RATE, weight_decay=WEIGHT_DECAY)
     warmup = torch.optim.lr_scheduler.LinearLR(descent, 1 / WARMUP, total_iters=WARMUP)
     cosine = torch.optim.lr_scheduler.CosineAnnealingLR(descent, max(1, steps - WARMUP), RATE * LAST)

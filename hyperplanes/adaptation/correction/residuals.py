@@ -109,7 +109,7 @@ class ResidualField:
     @torch.no_grad()
     def readings(
         self, pictures: Pictures, cameras: PinholeCamera, view: int
-    ) -> Float[Tensor, "21 height width"] | None:
+    ) -> Float[Tensor, "16 height width"] | None:
         """The inputs of a correction network for one of these pictures; None if it shows nothing of the scene.
 
         Args:
@@ -118,16 +118,12 @@ class ResidualField:
             view: index of the picture.
         """
         seen, rays, depth = self._surface(pictures, cameras, view)
-        radius, centre = self.views.bounds.radius, rays.origins.new_tensor(self.views.bounds.centre)
-        points = torch.stack([rays.at(depth + radius * offset) for offset in DEPTH_OFFSETS])
+        points = torch.stack([rays.at(depth + self.views.bounds.radius * offset) for offset in DEPTH_OFFSETS])
         found = self._reprojected(points, rays.directions)
         if found is None:
             return None
-        middle = ((rays.at(depth) - centre) * rays.directions).sum(1) / radius
-        return readings(
-            pictures.images[view].to(depth), pictures.opacity[view, 0].to(depth), seen,
-            found, middle, len(self.views),
-        )  # fmt: skip
+        image, opacity = pictures.images[view].to(depth), pictures.opacity[view, 0].to(depth)
+        return readings(image, opacity, seen, found, len(self.views))
 
     def _added(self, pictures: Pictures, cameras: PinholeCamera, view: int) -> Float[Tensor, "3 height width"]:
         """What is added to the colours of a picture."""
