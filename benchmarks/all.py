@@ -25,6 +25,7 @@ import torch
 from benchmarks import tables
 from benchmarks.parts.load import OF_SPEED
 from benchmarks.parts.options import positive
+from benchmarks.parts.view_tables import OF_CORRECTION
 from hyperplanes.utilities.machine.environment import usable_cores
 
 __all__ = ["COMMANDS", "OF_DATA", "OF_GPU", "OF_SUITES", "main"]
@@ -56,7 +57,7 @@ MORE = {"baked": ["--objects", "2", "--query", "4", "--counts", "25", "3"]}
 """The options of these benchmarks other than --data."""
 
 _METHODS = ["--methods", "nearest_view", "hull_blend", "hull_blend_reflected", "unreflected"]
-_TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", *_METHODS, "uncorrected"]
+_TEN = ["--objects", "10", "--query", "2", "--counts", "1", "3", "5", "25", *_METHODS, *OF_CORRECTION]
 _TUNED = ["--counts", "3", "25", "--query", "2", "--steps", "100", "--methods", "hull_blend"]
 OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_procedural": (["procedural"], _TEN),
@@ -64,7 +65,7 @@ OF_SUITES: dict[str, tuple[list[str], list[str]]] = {
     "views_random": (["random"], [*_TEN, "swapped"]),
     "views_posed": (
         ["posed"],
-        ["--query", "5", "--counts", "1", "3", "5", "25", "50", *_METHODS, "uncorrected"],
+        ["--query", "5", "--counts", "1", "3", "5", "25", "50", *_METHODS, *OF_CORRECTION],
     ),
     "views_srn": (["srn"], ["--inputs", "64", "--query", "10", "--objects", "10", *_METHODS]),
     "views_srn_2": (["srn"], ["--inputs", "64", "128", "--query", "10", "--objects", "10", *_METHODS]),

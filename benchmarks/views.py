@@ -35,6 +35,7 @@ from torch.nn.functional import pad
 
 from benchmarks.parts.options import positive
 from benchmarks.parts.reporting import Row, finish
+from benchmarks.parts.view_tables import OF_CORRECTION
 from hyperplanes.adaptation import HullBlend, HyperPlanes, NearestView
 from hyperplanes.adaptation.alignment.canonical_frame import to_canonical_frame
 from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
@@ -218,9 +219,6 @@ def suite_folders(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -
             parser.error(f"--root: expected {path}, found nothing there; make it by\n  {made_by(suite, path)}")
     return folders
 
-
-OF_CORRECTION = ("uncorrected", "residuals_alone")
-"""The methods without residual correction, and without the network that computes it."""
 
 SUITES: dict[str, dict[str, str]] = {
     "procedural": {

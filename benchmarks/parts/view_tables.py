@@ -8,7 +8,16 @@ from benchmarks.parts.reporting import Row
 from hyperplanes.adaptation.correction.residuals import MIN_CORRECTED_VIEWS
 from hyperplanes.utilities.files.tables import markdown_table
 
-__all__ = ["NAMES", "Result", "views", "views_over", "views_residuals", "views_summary", "views_tuned"]
+__all__ = [
+    "NAMES",
+    "OF_CORRECTION",
+    "Result",
+    "views",
+    "views_over",
+    "views_residuals",
+    "views_summary",
+    "views_tuned",
+]
 
 Result = dict[str, Any]
 """The content of a file of results: the environment of the measurement, and the rows."""
@@ -35,6 +44,9 @@ METHODS = {
 }
 """The rows of the table `views`, in order."""
 
+
+OF_CORRECTION = ("uncorrected", "residuals_alone")
+"""The methods without residual correction, and without the network that computes it."""
 
 RowsOfViews = dict[tuple[str, int], Row]  # by method and number of views
 
@@ -100,16 +112,16 @@ def views_summary(*results: Result) -> str:
 
 
 def views_residuals(*results: Result) -> str:
-    """The table of one forward pass of `small` without and with residual correction, for three views or more."""
+    """The table of one forward pass of `small` without, with mean and with learned residual correction."""
     found, counts = _of_views(results)
     lines = []
     for name, rows in found.items():
-        for count in (each for each in counts if each >= MIN_CORRECTED_VIEWS and ("uncorrected", each) in rows):
-            scores = [rows[method, count]["psnr"] for method in ("hull_blend", "uncorrected", "one_step")]
-            over = _above(rows["one_step", count], "over_uncorrected")
+        for count in (each for each in counts if each >= MIN_CORRECTED_VIEWS and ("residuals_alone", each) in rows):
+            scores = [rows[method, count]["psnr"] for method in ("hull_blend", *OF_CORRECTION, "one_step")]
+            over = [_above(rows["one_step", count], f"over_{method}") for method in OF_CORRECTION]
             objects = rows["one_step", count]["objects"]
-            lines.append([f"{name} ({objects})", str(count), *(f"{score:.2f}" for score in scores), over])
-    headings = ["views", "`hull_blend`", "without", "with residual correction", "gain"]
+            lines.append([f"{name} ({objects})", str(count), *(f"{score:.2f}" for score in scores), *over])
+    headings = ["views", "`hull_blend`", "none", "mean residual", "network", "over none", "over the mean residual"]
     return markdown_table(["", *headings], lines)
 
 
