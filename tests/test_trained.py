@@ -17,7 +17,7 @@ from hyperplanes.adaptation import HullBlend, HyperPlanes, ResidualField, diagno
 from hyperplanes.adaptation.alignment.rotation import RotatedField, Rotation
 from hyperplanes.adaptation.correction import residuals
 from hyperplanes.adaptation.correction.stacking import StackedField
-from hyperplanes.adaptation.correction_network import CorrectionNetwork
+from hyperplanes.adaptation.correction_network import OPACITY, CorrectionNetwork
 from hyperplanes.adaptation.fine_tuning import make_descent
 from hyperplanes.adaptation.optimisation import learned_steps
 from hyperplanes.adaptation.optimisation.descent import LEAST, contrast, draw_pixels
@@ -449,31 +449,25 @@ def test_residuals_raise_psnr_and_residuals_of_shuffled_views_lower_it(monkeypat
 
 
 def test_the_correction_network_raises_psnr_because_of_what_it_reads(monkeypatch):
-    """Its weights, the support views at several depths, and what it reads besides the candidates."""
+    """Measured: 0.83 dB over the mean residual, 0.72 over an untrained network, 2.9 over inputs of other pixels."""
     field, support, network = composition(25), shape().support, HyperPlanes.from_pretrained("small").corrector
 
-    def score(chosen=network):
+    def score(chosen):
         return quality(ResidualField(field, support, chosen), shape())
 
-    whole, alone, untrained = score(), score(None), score(CorrectionNetwork())
-    print(whole, alone, untrained)
-    assert whole > alone + 0.3
-    assert whole > untrained + 0.2
-    with monkeypatch.context() as patch:
-        forward = CorrectionNetwork.forward
-        for hidden in (slice(13, 15), slice(12)):
-            patch.setattr(
-                CorrectionNetwork, "forward", lambda own, read, hidden=hidden: forward(own, shuffled(read, hidden))
-            )
-            print(score())
+    whole = score(network)
+    assert whole > score(None) + 0.4
+    assert whole > score(CorrectionNetwork()) + 0.4
+    forward = CorrectionNetwork.forward
+    monkeypatch.setattr(CorrectionNetwork, "forward", lambda own, read: forward(own, of_other_pixels(read)))
+    assert whole > score(network) + 1
 
 
-def shuffled(read, inputs):
-    """Inputs of a correction network, of which some are those of other pixels."""
+def of_other_pixels(read):
+    """The inputs of a correction network, but the picture and the candidates of each pixel are those of another one."""
     order = torch.randperm(read[0, 0].numel(), generator=torch.Generator().manual_seed(0))
-    read = read.clone()
-    read[:, inputs] = read[:, inputs].flatten(2)[:, :, order].unflatten(2, read.shape[2:])
-    return read
+    shown = read[:, : OPACITY.start].flatten(2)[:, :, order].unflatten(2, read.shape[2:])
+    return torch.cat([shown, read[:, OPACITY.start :]], 1)
 
 
 def test_residuals_of_three_views_raise_psnr():
