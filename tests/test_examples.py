@@ -22,7 +22,7 @@ def test_the_readme_runs(tmp_path, monkeypatch):
     assert first.count("  # 25 images for the model, 25 others to compare with\n") == 1
     few = "\nassert (len(task.support), len(task.query)) == (25, 25)"
     few += "\nimport dataclasses; task = dataclasses.replace(task, query=task.query[:2])\n"
-    with small_packaged(residuals=False):
+    with small_packaged(residuals=False, learned_correction=False):
         exec(first.replace("  # 25 images for the model, 25 others to compare with\n", few), here)
     assert len(list((tmp_path / "new-views").glob("*.png"))) == len(here["task"].query)
     assert (tmp_path / "turntable.webp").exists()
