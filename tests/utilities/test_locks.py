@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from hyperplanes.adaptation import network
+from hyperplanes.adaptation.correction import residuals
 from hyperplanes.geometry.kernels import compiling
 from hyperplanes.rendering import renderer
 from hyperplanes.utilities.machine.locks import ForkSafeLock
@@ -18,7 +19,7 @@ pytestmark = [
     pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system"),
     pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork.*:DeprecationWarning"),
 ]
-LOCKS = [seeding._alone, network._counting, renderer._counting, compiling._compiling]
+LOCKS = [seeding._alone, network._counting, renderer._counting, compiling._compiling, residuals._rendering]
 
 
 def ends_in_a_child(work):
@@ -47,7 +48,7 @@ def test_a_child_does_not_wait_for_locks_that_other_threads_hold():
     def work():
         with seeding.seeded(0), network.in_use(torch.nn.Identity()), renderer.allow_tf32(torch.device("cuda")):
             pass
-        with compiling._compiling:
+        with compiling._compiling, residuals._rendering:
             pass
 
     thread = threading.Thread(target=hold)
