@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -117,7 +118,7 @@ def fit_correction(
         descent.step()
         schedule.step()
         if on_step is not None:
-            on_step(step + 1, float(torch.stack(gains).mean()) * 10 / torch.log(torch.tensor(10.0)).item())
+            on_step(step + 1, float(torch.stack(gains).mean()) * 10 / math.log(10))
     return network.requires_grad_(requires_grad=False)
 
 
