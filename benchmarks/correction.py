@@ -3,10 +3,10 @@
     python -m benchmarks correction --data data/cars data/random --objects 60 --out FOLDER
 
 Each held-out object gives one example of a random number of views: every third one after 100 gradient steps, the others
-after one forward pass, and every fourth one with small errors of its camera poses. The objects must be neither in the
-training data of the model nor in any table of results. If the model has a correction network, the training continues
-from that. The result is a copy of the model with the correction network. `python -m benchmarks views --methods
-uncorrected residuals_alone` measures its effect.
+after one forward pass, and every fifth one with small errors of its camera poses and colours. The objects must be
+neither in the training data of the model nor in any table of results. If the model has a correction network, the
+training continues from that. The result is a copy of the model with the correction network. `python -m benchmarks views
+--methods uncorrected residuals_alone` measures its effect.
 """
 
 from __future__ import annotations
@@ -24,15 +24,23 @@ from hyperplanes.adaptation import HyperPlanes
 from hyperplanes.adaptation.checkpoints import find_checkpoint
 from hyperplanes.data import open_dataset
 from hyperplanes.data.support import FarthestSupport
-from hyperplanes.training.correction import CORRECTION_STEPS, CorrectionExample, disturbed, example_of, fit_correction
+from hyperplanes.training.correction import (
+    CORRECTION_STEPS,
+    CorrectionExample,
+    disturbed,
+    example_of,
+    fit_correction,
+    recoloured,
+)
 
 __all__ = ["main"]
 
 COUNTS = (3, 4, 5, 8, 12, 18, 25, 25)  # numbers of support views; more pictures are from many
 QUERY = 6
-MAX_DISTURBANCE = 0.8  # degrees
+MAX_DISTURBANCE = 1.0  # degrees
+MAX_EXPOSURE = 0.12  # standard deviation of the logarithm of exposures
 GRADIENT_STEPS = 100
-EVERY_TUNED, EVERY_DISTURBED = 3, 4  # one of as many examples
+EVERY_TUNED, EVERY_DISTURBED = 3, 5  # one of as many examples
 
 
 def main(arguments: list[str]) -> int:
@@ -51,8 +59,9 @@ def main(arguments: list[str]) -> int:
         for number, name in enumerate(sorted(data.names("test"))[: 1 if chosen.quick else chosen.objects]):
             task = FarthestSupport(data, draws.choice(COUNTS), QUERY).task(name)
             if number % EVERY_DISTURBED == EVERY_DISTURBED - 1:
-                degrees = draws.uniform(0, MAX_DISTURBANCE)
-                task = replace(task, support=disturbed(task.support, degrees, generator))
+                support = disturbed(task.support, draws.uniform(0, MAX_DISTURBANCE), generator)
+                support = recoloured(support, draws.uniform(0, MAX_EXPOSURE), generator)
+                task = replace(task, support=support)
             found = example_of(model, task, GRADIENT_STEPS if number % EVERY_TUNED == EVERY_TUNED - 1 else 0)
             examples += [found] if found is not None else []
         print(f"{path}: {len(examples)} examples", flush=True)

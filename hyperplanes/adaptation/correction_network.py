@@ -17,13 +17,13 @@ DEPTH_OFFSETS = (-0.06, -0.03, 0.0, 0.03, 0.06)
 
 READINGS = 16  # inputs for a pixel
 COLOUR, CANDIDATES, OPACITY = slice(3), slice(3, 12), slice(12, 13)  # of the inputs
+DEVIATIONS = slice(13, 15)  # of the inputs
 INITIAL_WEIGHTS = (0.0, 1.0, 0.0)  # of the candidates
 WIDTH, BLOCKS = 32, 2  # channels, and residual blocks of two convolutions each
 REACH = 2 + 2 * BLOCKS  # pixels between an output and its farthest input
 OUTPUT_SCALE = 0.3
 WINDOW = 5  # pixels a side, over which the disagreement of support views is averaged
 DISAGREEMENT_SCALE = 1e-3  # difference of variances by which one depth is e times as likely as another one
-OFFSET_PENALTY = 1 / 3  # variance per squared radius by which depths of the field are preferred
 MIN_CORRECTED_OPACITY = 0.01  # from which on a pixel is corrected in part
 FULL_CORRECTION_OPACITY = 1 / 3  # and in full
 
@@ -53,8 +53,7 @@ def readings(
         found: what support views show at each of DEPTH_OFFSETS of these pixels, (offset, pixel, value).
         views: number of support views.
     """
-    offsets = found.weight.new_tensor(DEPTH_OFFSETS)[:, None, None]
-    disagreement = _in_windows(found.image_variance[..., 0], seen)[..., None] + OFFSET_PENALTY * offsets.square()
+    disagreement = _in_windows(found.image_variance[..., 0], seen)[..., None]
     likelihood = torch.softmax(-disagreement / DISAGREEMENT_SCALE, 0)
     best = found.map(lambda values: (likelihood * values).sum(0))
     colours, part = image[:, seen].T, covered(opacity[seen])[:, None]
@@ -74,7 +73,7 @@ def readings(
     return result
 
 
-def _in_windows(values: Float[Tensor, "offset pixel"], seen: Bool[Tensor, "height width"]) -> Tensor:
+def _in_windows(values: Float[Tensor, "depth pixel"], seen: Bool[Tensor, "height width"]) -> Tensor:
     """The mean over the seen pixels of the window around each seen pixel."""
     maps = values.new_zeros(len(values) + 1, *seen.shape)
     maps[:-1, seen], maps[-1, seen] = values, 1

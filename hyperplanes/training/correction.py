@@ -13,18 +13,19 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from hyperplanes.adaptation.correction.residuals import ResidualField
-from hyperplanes.adaptation.correction_network import COLOUR, OPACITY, CorrectionNetwork
+from hyperplanes.adaptation.correction_network import CANDIDATES, COLOUR, DEVIATIONS, OPACITY, CorrectionNetwork
 from hyperplanes.adaptation.hyperplanes import HyperPlanes
 from hyperplanes.utilities.tensors.seeding import seeded
 from hyperplanes.views import Task, Views
 
-__all__ = ["CorrectionExample", "disturbed", "example_of", "fit_correction"]
+__all__ = ["CorrectionExample", "disturbed", "example_of", "fit_correction", "recoloured"]
 
 CORRECTION_STEPS = 6000
 PICTURES_PER_STEP, CROP = 6, 96  # pictures per step, and pixels a side of the part that is used
 SEED = 0  # of the initial weights and the random draws
 RATE, WARMUP, LAST = 2e-3, 50, 0.02  # learning rate of AdamW, steps of warm-up, and the final rate as a fraction
 WEIGHT_DECAY = 1e-4
+LEAST_CONTRAST = 0.7  # of random colours: of all channels, and of single ones once more
 MIN_ERROR = 1e-5  # added to squared errors before the logarithm: 50 dB
 
 
@@ -58,6 +59,31 @@ def disturbed(views: Views, degrees: float, generator: torch.Generator) -> Views
     return replace(views, cameras=PinholeCamera(cameras.intrinsics, poses, cameras.height, cameras.width))
 
 
+def recoloured(views: Views, spread: float, generator: torch.Generator) -> Views:
+    """The views with errors of exposure and white balance, and noise, as photographs have.
+
+    Args:
+        views: of an object, with masks.
+        spread: standard deviation of the logarithm of the exposure of a view. That of each channel differs by a third
+            of it, and the standard deviation of the noise of a pixel is a tenth.
+        generator: of the errors, on the CPU.
+
+    Raises:
+        ValueError: views without masks.
+    """
+    if views.masks is None:
+        raise ValueError("views: expected masks, got none")
+
+    def draw(*shape: int) -> Tensor:
+        return spread * torch.randn(shape, generator=generator).to(views.images)
+
+    background = 1 - views.masks
+    gains = (draw(len(views), 1, 1, 1) + draw(len(views), 3, 1, 1) / 3).exp()
+    noise = views.masks * draw(*views.images.shape) / 10
+    object_colours = (gains * (views.images - background) + noise).clamp_min(0).minimum(views.masks)
+    return replace(views, images=object_colours + background)
+
+
 def example_of(model: HyperPlanes, task: Task, steps: int = 0) -> CorrectionExample | None:
     """The training example of one object; None if a query view shows nothing that a support view sees.
 
@@ -81,7 +107,9 @@ def fit_correction(
     start: CorrectionNetwork | None = None,
     on_step: Callable[[int, float], None] | None = None,
 ) -> CorrectionNetwork:
-    """Train a correction network with AdamW on the PSNR of parts of pictures, which are rotated and mirrored randomly.
+    """Train a correction network with AdamW on the PSNR of parts of pictures.
+
+    These are rotated, mirrored and recoloured randomly.
 
     Args:
         examples: examples of objects, with all numbers of support views.
@@ -142,8 +170,20 @@ def _part(example: CorrectionExample, generator: torch.Generator) -> tuple[Tenso
     parts = [each[:, top : top + CROP, left : left + CROP].float() for each in (read, truth)]
     turns, mirrored = draw(4), draw(2)
     parts = [each.rot90(turns, (1, 2)) for each in parts]
-    read, truth = (each.flip(2)[None] if mirrored else each[None] for each in parts)
-    return read, truth
+    read, truth = (each.flip(2) if mirrored else each for each in parts)
+    return _with_random_colours(read, truth, generator)
+
+
+def _with_random_colours(read: Tensor, truth: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """The picture with permuted channels, each with another contrast to the white background."""
+    order = torch.randperm(3, generator=generator)
+    contrast = LEAST_CONTRAST + (1 - LEAST_CONTRAST) * torch.rand(4, generator=generator)
+    contrast = (contrast[0] * contrast[1:])[:, None, None]
+    read = read.clone()
+    read[COLOUR] = 0.5 - contrast * (0.5 - read[COLOUR][order])
+    read[CANDIDATES] = (contrast * read[CANDIDATES].unflatten(0, (-1, 3))[:, order]).flatten(0, 1)
+    read[DEVIATIONS] *= contrast.square().mean().sqrt()
+    return read[None], 1 - contrast * (1 - truth[None, order])
 
 
 def _log_error(image: Tensor, truth: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering import RayMarching
-from hyperplanes.training.correction import CorrectionExample, disturbed, example_of, fit_correction
+from hyperplanes.training.correction import CorrectionExample, disturbed, example_of, fit_correction, recoloured
 from hyperplanes.views import Views
 from tests.adaptation import test_stacking
 from tests.reference_rendering import Balls, ball_views, camera_at, ring
@@ -159,19 +159,18 @@ def test_a_correction_network_without_residuals_is_refused():
 
 
 def test_training_finds_which_candidate_is_right_and_where():
-    """In dark pixels the third candidate is right, in bright ones a quarter of the first: 0.1 and 0.05 are left."""
+    """In nearly transparent pixels the third candidate is right, in opaque ones a quarter of the second."""
     generator = torch.Generator().manual_seed(0)
 
     def example():
         read = 0.2 * torch.randn(2, READINGS, 16, 16, generator=generator)
-        read[:, OPACITY] = 1.0
-        dark = (torch.rand(2, 1, 16, 16, generator=generator) < 0.5).float()
-        read[:, :3] = 0.2 - 0.4 * dark
-        added = dark * read[:, 9:12] + (1 - dark) * read[:, 3:6] / 4
+        faint = (torch.rand(2, 1, 16, 16, generator=generator) < 0.5).float()
+        read[:, OPACITY] = 1 - 0.9 * faint
+        added = faint * read[:, 9:12] + (1 - faint) * read[:, 6:9] / 4
         return CorrectionExample(read.half(), read[:, :3] + 0.5 + added)
 
     gains = []
-    network = fit_correction([example() for _ in range(8)], steps=100, on_step=lambda _, gain: gains.append(gain))
+    network = fit_correction([example() for _ in range(8)], steps=150, on_step=lambda _, gain: gains.append(gain))
     assert gains[-1] > gains[0] + 10
     test = example()
     error = (test.read[:, :3].float() + 0.5 + network(test.read.float()) - test.truth).square().mean().sqrt()
@@ -200,3 +199,23 @@ def test_disturbed_cameras_are_rotated_by_the_angle_and_moved(many):
     moved = found.cameras.translation_vector - after.to(before) @ before.mT @ many.cameras.translation_vector.double()
     assert 0.01 < float(moved.norm(dim=1).mean()) < 0.12
     assert torch.equal(found.images, many.images)
+
+
+def test_recoloured_views_have_other_exposures_and_the_same_background(many):
+    """The logarithm of the ratio of colours has the variance of exposure, white balance and noise, 1 + 1/9 and more."""
+    masks = torch.zeros(len(many), 1, *many.size)
+    masks[..., 4:20, 4:20] = 1.0
+    grey = replace(many, images=1 - masks.expand(-1, 3, -1, -1) / 2, masks=masks)
+    generator = torch.Generator().manual_seed(0)
+    ratios = []
+    for _ in range(100):
+        found = recoloured(grey, 0.1, generator)
+        assert torch.equal(found.images[..., :4, :], grey.images[..., :4, :])
+        assert torch.equal(found.masks, masks)
+        ratios.append((found.images[..., 4:20, 4:20] / 0.5).log().mean((2, 3)))
+    spread = torch.cat(ratios)
+    assert 0.095 < float(spread.std()) < 0.115
+    between = (spread - spread.mean(1, keepdim=True)).square().sum(1).mean().div(2).sqrt()
+    assert 0.03 < float(between) < 0.037
+    with pytest.raises(ValueError, match="views: expected masks"):
+        recoloured(replace(many, masks=None), 0.1, generator)

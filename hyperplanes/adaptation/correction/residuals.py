@@ -28,7 +28,7 @@ from hyperplanes.adaptation.correction_network import (
     readings,
 )
 from hyperplanes.adaptation.network import HyperPlanesNetwork
-from hyperplanes.adaptation.reprojection import CHANNELS, Reprojected, are_near, reproject
+from hyperplanes.adaptation.reprojection import CHANNELS, Reprojected, nearest_views, reproject
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.chosen_views import PENALTY_RADIANS
 from hyperplanes.geometry.image_planes import ImagePlanes
@@ -171,13 +171,13 @@ class ResidualField:
             points: one or several of each ray, the farthest last.
             directions: of the rays.
         """
-        farthest = points[-1] if points.dim() > 2 else points
-        chosen = are_near(self._planes, farthest, directions).nonzero()[:, 0]
-        if not len(chosen):
+        chosen, near = nearest_views(self._planes, points[-1] if points.dim() > 2 else points, directions)
+        if not near.any():
             return None
-        self._compute(chosen.tolist())
-        along = directions.expand_as(points).flatten(0, -2)
-        found = reproject(self._planes, chosen, points.flatten(0, -2), along, self.views.bounds.radius)
+        self._compute(near.nonzero()[:, 0].tolist())
+        depths, radius = points.numel() // directions.numel(), self.views.bounds.radius
+        views, along = chosen.repeat(depths, 1), directions.repeat(depths, 1)
+        found = reproject(self._planes, views, points.flatten(0, -2), along, radius)
         return found.map(lambda values: values.view(*points.shape[:-1], -1))
 
     def _beside(self, view: int) -> Renderable:
