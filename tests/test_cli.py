@@ -775,7 +775,7 @@ def test_pictures_of_many_views_are_corrected_unless_that_is_off(tmp_path, monke
     assert max(abs(pixels(one) - pixels(other)).max() for one, other in zip(corrected, plain, strict=True)) > 5
 
 
-def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
+def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path, capsys):
     demo = demo_folder()
     scene = str(first_object(demo))
     weights, out, reference = (str(tmp_path / name) for name in ("weights", "out", "reference"))
@@ -786,6 +786,11 @@ def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path):
         assert path.read_bytes() == (Path(reference) / path.name).read_bytes()
     assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, "--steps", "2"]) == 0
     assert any(path.read_bytes() != (Path(reference) / path.name).read_bytes() for path in Path(out).iterdir())
+    assert "other images" not in capsys.readouterr().err
+    other = str(sorted(path for path in Path(scene).parent.iterdir() if path.is_dir())[1])
+    for verb in (["render"], ["export", "--what", "points"]):
+        assert main([*verb, "--checkpoint", weights, "--views", other, "--out", str(tmp_path / verb[0])]) == 0
+        assert f"made from other images, of {Path(scene).name}; the field reads its" in capsys.readouterr().err
     frozen = ["--steps", "2", "--fine-tune", "hypernetwork"]  # adapted weights have no hypernetwork
     assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, *frozen]) == 2
 

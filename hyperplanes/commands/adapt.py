@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hyperplanes.commands.inputs.fields import adapt_to, load_adaptable, refuse_baked
+from hyperplanes.commands.inputs.object_record import record_object
 from hyperplanes.commands.inputs.scene import read_object, refuse_sources
 from hyperplanes.commands.options import Free, ObjectArguments, check_fine_tune
 from hyperplanes.commands.output.console import Console
@@ -50,6 +51,8 @@ def run(arguments: Arguments) -> int:
     field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)
     assert isinstance(field, AdaptedField)
     model.with_weights_of(field).save(arguments.out)
+    if not arguments.learn_background:  # which changes the images
+        record_object(arguments.out, task.name, task.support)
     same = [] if (arguments.up, up) == ("auto", "y") else [f"--up={up}"]
     same += ["--all-views"] * arguments.all_views + ["--learn-background"] * arguments.learn_background
     same += ["--refine-poses"] * arguments.refine_poses

@@ -113,8 +113,9 @@ def scene(name):
     return AdaptedField(mist, full(bounds, 24), RayMarching(96, 0.0)), Views(images, near, None, bounds), asked
 
 
-@pytest.mark.parametrize("name", ["ball", "mist"])
-def test_corrected_pixels_agree_with_a_loop_over_the_views(name):
+@pytest.mark.parametrize(("name", "most"), [("ball", 8), ("ball", 2), ("mist", 8)])
+def test_corrected_pixels_agree_with_a_loop_over_the_nearest_views(name, most, monkeypatch):
+    monkeypatch.setattr(reprojection, "MAX_VIEWS", most)
     field, support, asked = scene(name)
     plain, found = field.render(asked), ResidualField(field, support).render(asked).images[0]
     own, faint, outside, changed = field.render(support.cameras), 0, 0, 0
@@ -129,10 +130,10 @@ def test_corrected_pixels_agree_with_a_loop_over_the_views(name):
         ray = cast(asked, torch.tensor([0]), torch.tensor([[column, row]]), support.bounds)
         point = ray.origins[0] + depth * ray.directions[0]
         total, weights = torch.zeros(3), reprojection.DOUBT
-        for view in range(len(support)):
-            one = camera.select(support.cameras, [view])
-            offset = point - camera.centres(one)[0].to(point)
-            aside = 1 - float(offset @ ray.directions[0].to(offset) / offset.norm())
+        offsets = point - camera.centres(support.cameras).to(point)
+        asides = 1 - offsets @ ray.directions[0].to(offsets) / offsets.norm(dim=1)
+        for view in asides.argsort()[:most].tolist():
+            one, offset, aside = camera.select(support.cameras, [view]), offsets[view], float(asides[view])
             x, y = one.project(point[None].to(one.extrinsics))[0].tolist()
             if aside >= reprojection.MAX_COSINE_DISTANCE:
                 continue

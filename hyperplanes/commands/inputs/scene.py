@@ -27,13 +27,16 @@ __all__ = ["prepare_task", "read_object", "read_path", "read_scene", "refuse_sou
 def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, console: Console) -> tuple[Task, str]:
     """As `read_scene`, with the options that the verbs for one object share.
 
-    If requested, the background is learned and the poses are refined.
+    If requested, the background is learned and the poses are refined. It warns if the model is the weights of another
+    object.
 
     Args:
         arguments: the options.
         source: the model that will adapt to the views, or a baked scene.
         console: prints messages.
     """
+    from hyperplanes.commands.inputs.object_record import other_object
+
     task, up = read_scene(
         arguments.views,
         console,
@@ -41,6 +44,8 @@ def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, co
         up=arguments.up,
         downscale=arguments.downscale,
     )
+    if (warning := other_object(arguments.checkpoint, task.support)) and not arguments.learn_background:
+        console.warn(warning)
     return prepare_task(arguments, task, source, console, all_views=arguments.all_views), up
 
 
