@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -132,8 +133,8 @@ def _video(frames: npt.NDArray[np.uint8], kind: str, rate: float) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"video.{kind}"
         size = (even.shape[2], even.shape[1])
-        how = {**CODECS[kind], "macro_block_size": 2, "ffmpeg_log_level": "error"}
-        writer = write_frames(str(path), size, fps=rate, **how)
+        how: dict[str, Any] = {**CODECS[kind], "fps": rate, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        writer = write_frames(str(path), size, **how)
         writer.send(None)
         for frame in even:
             writer.send(np.ascontiguousarray(frame))
