@@ -790,7 +790,7 @@ def test_an_adapted_object_renders_the_same_without_its_hypernetwork(tmp_path, c
     other = str(sorted(path for path in Path(scene).parent.iterdir() if path.is_dir())[1])
     for verb in (["render"], ["export", "--what", "points"]):
         assert main([*verb, "--checkpoint", weights, "--views", other, "--out", str(tmp_path / verb[0])]) == 0
-        assert f"made from other images, of {Path(scene).name}; the field reads its" in capsys.readouterr().err
+        assert f"made from other images, of {Path(scene).name}, and fit no other object" in capsys.readouterr().err
     frozen = ["--steps", "2", "--fine-tune", "hypernetwork"]  # adapted weights have no hypernetwork
     assert main(["render", "--checkpoint", weights, "--views", scene, "--out", out, *frozen]) == 2
 

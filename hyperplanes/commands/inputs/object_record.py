@@ -50,8 +50,8 @@ def other_object(weights: Path, support: Views) -> str | None:
     if set(recorded) & set(_digests(support)):
         return None
     return (
-        f"{weights}: these weights were made from other images, of {name}; the field reads its colours from the "
-        "images, so the pictures will be wrong; give the images and options that `adapt` was given"
+        f"{weights}: these weights were made from other images, of {name}, and fit no other object; give the images "
+        "and options that `adapt` was given, or a model that adapts to these images, such as small"
     )
 
 
