@@ -51,8 +51,7 @@ def run(arguments: Arguments) -> int:
     field, _ = adapt_to(model, task.support.to(device), task.name, console, steps=arguments.steps, settings=settings)
     assert isinstance(field, AdaptedField)
     model.with_weights_of(field).save(arguments.out)
-    if not arguments.learn_background:  # which changes the images
-        record_object(arguments.out, task.name, task.support)
+    record_object(arguments.out, task.name, None if arguments.learn_background else task.support)
     same = [] if (arguments.up, up) == ("auto", "y") else [f"--up={up}"]
     same += ["--all-views"] * arguments.all_views + ["--learn-background"] * arguments.learn_background
     same += ["--refine-poses"] * arguments.refine_poses

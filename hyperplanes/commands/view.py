@@ -76,7 +76,7 @@ class Arguments(ViewsArguments):
 
 def run(arguments: Arguments) -> int:
     """Serve the page until Ctrl-C."""
-    from hyperplanes.commands.inputs.object_record import other_object
+    from hyperplanes.commands.inputs.object_record import warn_of_other_object
     from hyperplanes.data.devices import choose_device
     from hyperplanes.export.baking import BakedScene
     from hyperplanes.export.live import LiveViewer, require_viewer
@@ -97,8 +97,8 @@ def run(arguments: Arguments) -> int:
     refuse_of_baked(source, given)
     others = _others(arguments, device)
     task, _ = read_scene(arguments.views, console, all_views=True, up=arguments.up, downscale=arguments.downscale)
-    if (warning := other_object(arguments.checkpoint, task.support)) and not arguments.learn_background:
-        console.warn(warning)
+    if not arguments.learn_background:
+        warn_of_other_object(arguments.checkpoint, task.support, console)
     shown = prepare_task(arguments, task, source, console, all_views=True).support.to(device)
     wanted: queue.SimpleQueue[int] = queue.SimpleQueue()
     baked = isinstance(source, BakedScene)

@@ -10,7 +10,9 @@ from hyperplanes.adaptation import CorrectedField, HyperPlanes, ResidualField, c
 from hyperplanes.adaptation.base import AdaptedField
 from hyperplanes.adaptation.correction_network import (
     CANDIDATES,
+    COLOUR,
     DEPTH_OFFSETS,
+    DEVIATIONS,
     MIN_CORRECTED_OPACITY,
     OPACITY,
     READINGS,
@@ -20,7 +22,14 @@ from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere
 from hyperplanes.rendering import RayMarching
-from hyperplanes.training.correction import CorrectionExample, disturbed, example_of, fit_correction, recoloured
+from hyperplanes.training.correction import (
+    CorrectionExample,
+    _with_random_colours,
+    disturbed,
+    example_of,
+    fit_correction,
+    recoloured,
+)
 from hyperplanes.views import Views
 from tests.adaptation import test_stacking
 from tests.reference_rendering import Balls, ball_views, camera_at, ring
@@ -176,6 +185,26 @@ def test_training_finds_which_candidate_is_right_and_where():
     error = (test.read[:, :3].float() + 0.5 + network(test.read.float()) - test.truth).square().mean().sqrt()
     assert error < 0.03
     assert not any(weights.requires_grad for weights in network.parameters())
+
+
+def test_recoloured_pictures_have_recoloured_candidates_and_errors():
+    """If a candidate is the error of a picture, it is that of the recoloured one; white stays white."""
+    generator = torch.Generator().manual_seed(0)
+    read, found = torch.rand(READINGS, 8, 8, generator=generator), set()
+    read[COLOUR, :, :4] = 0.5  # white
+    truth = read[COLOUR] + 0.5 + read[CANDIDATES][3:6]
+    for _ in range(20):
+        recoloured_read, recoloured_truth = _with_random_colours(read, truth, generator)
+        plain = recoloured_read[0, COLOUR] + 0.5
+        torch.testing.assert_close(plain + recoloured_read[0, CANDIDATES][3:6], recoloured_truth[0])
+        assert (plain[:, :, :4] == 1).all()
+        contrast = (recoloured_read[0, CANDIDATES][3:6].square().sum() / read[CANDIDATES][3:6].square().sum()).sqrt()
+        deviations = recoloured_read[0, DEVIATIONS] / read[DEVIATIONS]
+        torch.testing.assert_close(deviations, contrast.expand_as(deviations), atol=0.05, rtol=0)
+        found.add(round(float(contrast), 3))
+        assert torch.equal(recoloured_read[0, OPACITY], read[OPACITY])
+    assert len(found) > 10
+    assert 0.49 < min(found) < max(found) < 1
 
 
 def test_examples_are_the_readings_of_the_query_views(model):

@@ -133,9 +133,9 @@ class ResidualField:
             return self.network(read[None].to(weights))[0] if read is not None else torch.zeros_like(pictures.images[0])
         result = torch.zeros_like(pictures.images[view])
         seen, rays, depth = self._surface(pictures, cameras, view)
-        found = self._reprojected(rays.at(depth), rays.directions)
+        found = self._reprojected(rays.at(depth)[None], rays.directions)
         if found is not None:
-            result[:, seen] = found.residual.T.to(result) * covered(pictures.opacity[view, 0][seen])
+            result[:, seen] = found.residual[0].T.to(result) * covered(pictures.opacity[view, 0][seen])
         return result
 
     def _surface(
@@ -163,7 +163,7 @@ class ResidualField:
                 on_view(view + 1)
 
     def _reprojected(
-        self, points: Float[Tensor, "*depth pixel 3"], directions: Float[Tensor, "pixel 3"]
+        self, points: Float[Tensor, "depth pixel 3"], directions: Float[Tensor, "pixel 3"]
     ) -> Reprojected | None:
         """What support views show at points seen along these directions; None if no view sees any of them.
 
@@ -171,14 +171,13 @@ class ResidualField:
             points: one or several of each ray, the farthest last.
             directions: of the rays.
         """
-        chosen, near = nearest_views(self._planes, points[-1] if points.dim() > 2 else points, directions)
+        chosen, near = nearest_views(self._planes, points[-1], directions)
         if not near.any():
             return None
         self._compute(near.nonzero()[:, 0].tolist())
-        depths, radius = points.numel() // directions.numel(), self.views.bounds.radius
-        views, along = chosen.repeat(depths, 1), directions.repeat(depths, 1)
-        found = reproject(self._planes, views, points.flatten(0, -2), along, radius)
-        return found.map(lambda values: values.view(*points.shape[:-1], -1))
+        views, along = (each.repeat(len(points), 1) for each in (chosen, directions))
+        found = reproject(self._planes, views, points.flatten(0, 1), along, self.views.bounds.radius)
+        return found.map(lambda values: values.view(*points.shape[:2], -1))
 
     def _beside(self, view: int) -> Renderable:
         """The field, which reads a support view as if it stood OWN_VIEW_ANGLE farther away."""

@@ -7,52 +7,52 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from hyperplanes.commands.output.console import Console
     from hyperplanes.views import Views
 
-__all__ = ["other_object", "record_object"]
+__all__ = ["record_object", "warn_of_other_object"]
 
 RECORD = "object.json"  # in the folder of the weights
 
 
-def record_object(weights: Path, name: str, support: Views) -> None:
-    """Write the record of an object beside its weights.
+def record_object(weights: Path, name: str, support: Views | None) -> None:
+    """Write the record of an object beside its weights, or delete one that is there.
 
     Args:
         weights: the folder of a checkpoint.
         name: of the object.
-        support: the views that the weights were made from.
+        support: the views that the weights were made from; None if later commands cannot reproduce their pixels.
     """
     from hyperplanes.utilities.files.writing import write_json
 
-    write_json(weights / RECORD, {"name": name, "views": _digests(support)})
+    path = weights / RECORD
+    if support is None:
+        path.unlink(missing_ok=True)
+    else:
+        write_json(path, {"name": name, "views": _digests(support)})
 
 
-def other_object(weights: Path, support: Views) -> str | None:
-    """A warning if weights were made from other views; None if there is no record or at least one view is the same.
+def warn_of_other_object(weights: Path, support: Views, console: Console) -> None:
+    """Warn if weights were made from other views: there is a record, and it has none of these.
 
     Args:
-        weights: a checkpoint.
+        weights: a checkpoint. DataError if its record is damaged.
         support: the views that the field will read.
-
-    Raises:
-        DataError: a damaged record.
+        console: prints the warning.
     """
-    from hyperplanes.utilities.files.reading import DataError, malformed, read_json
+    from hyperplanes.utilities.files.reading import malformed, read_json
 
     path = weights / RECORD
     if not path.is_file():
-        return None
-    with malformed(path, "a record that `adapt` wrote"):
+        return
+    with malformed(path, "a record that `hyperplanes adapt` wrote"):
         record = read_json(path)
-        name, recorded = record["name"], record["views"]
-        if not isinstance(recorded, list):
-            raise DataError(path, "a list of views", f"a {type(recorded).__name__}", "run `hyperplanes adapt` again")
-    if set(recorded) & set(_digests(support)):
-        return None
-    return (
-        f"{weights}: these weights were made from other images, of {name}, and fit no other object; give the images "
-        "and options that `adapt` was given, or a model that adapts to these images, such as small"
-    )
+        name, recorded = record["name"], set(record["views"])
+    if not recorded & set(_digests(support)):
+        console.warn(
+            f"{weights}: these weights were made from other images, of {name}, and fit no other object; give the "
+            "images and options that `adapt` was given, or a model that adapts to these images, such as small"
+        )
 
 
 def _digests(views: Views) -> list[str]:

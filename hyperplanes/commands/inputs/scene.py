@@ -35,7 +35,7 @@ def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, co
         source: the model that will adapt to the views, or a baked scene.
         console: prints messages.
     """
-    from hyperplanes.commands.inputs.object_record import other_object
+    from hyperplanes.commands.inputs.object_record import warn_of_other_object
 
     task, up = read_scene(
         arguments.views,
@@ -44,8 +44,8 @@ def read_object(arguments: ObjectArguments, source: HyperPlanes | BakedScene, co
         up=arguments.up,
         downscale=arguments.downscale,
     )
-    if (warning := other_object(arguments.checkpoint, task.support)) and not arguments.learn_background:
-        console.warn(warning)
+    if not arguments.learn_background:
+        warn_of_other_object(arguments.checkpoint, task.support, console)
     return prepare_task(arguments, task, source, console, all_views=arguments.all_views), up
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["check_output", "keep_if_possible", "refuse_checkpoint", "refuse_foreign", "writes_to"]
 
 READ = re.compile(
-    r"(manifest|model|training|transforms|diagnostics|initial|object)([-_]\w+)?\.json|.*_splits\.json|config\.yaml"
+    r"(manifest|model|training|transforms|diagnostics|initial)([-_]\w+)?\.json|object\.json|.*_splits\.json|config\.yaml"
 )
 """Names of files that are read as a part of a model, a training or a data set."""
 
