@@ -17,6 +17,7 @@ DEPTH_OFFSETS = (-0.06, -0.03, 0.0, 0.03, 0.06)
 
 READINGS = 16  # inputs for a pixel
 COLOUR, CANDIDATES, OPACITY = slice(3), slice(3, 12), slice(12, 13)  # of the inputs
+MEAN_RESIDUAL = slice(3, 6)  # at the depth of the field, the first candidate
 DEVIATIONS = slice(13, 15)  # of the inputs
 INITIAL_WEIGHTS = (0.0, 1.0, 0.0)  # of the candidates
 WIDTH, BLOCKS = 32, 2  # channels, and residual blocks of two convolutions each

@@ -62,6 +62,8 @@ class ModelConfig:
             the views (`adaptation.correction.residuals`).
         learned_correction: whether a network computes this correction (`adaptation.correction_network`);
             `training.correction` trains it after the model.
+        cross_validated_correction: whether its share in the correction is found by cross-validation on the support
+            views, in a model that gradient steps made for one object (`ResidualField.network_share`).
         symmetric: whether reflections of the views of an object that looks symmetric are added to its views
             (`adaptation.symmetry.detection`). Not used in training.
         symmetry: of the object, if it is known.
@@ -86,6 +88,7 @@ class ModelConfig:
     learned_steps: Annotated[int, range(33)] = 0
     residuals: bool = False
     learned_correction: bool = False
+    cross_validated_correction: bool = False
     symmetric: bool = False
     symmetry: Symmetry | None = None
     azimuth: float | None = None
@@ -123,9 +126,9 @@ class ModelConfig:
     def target_alone(self) -> ModelConfig:
         """The model of its target alone, without a network that finds weights and without averaged pictures."""
         alone = replace(self, hypernetwork=None, autoencoder=None, initialisation=None)
-        return replace(
-            alone, stacked=False, hull_share=0.0, gated=False, average=0.0, learned_steps=0, learned_correction=False
-        )
+        averaging = {"stacked": False, "hull_share": 0.0, "gated": False, "average": 0.0}
+        correction = {"learned_correction": False, "cross_validated_correction": False}
+        return replace(alone, **averaging, **correction, learned_steps=0)
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""

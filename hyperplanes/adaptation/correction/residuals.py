@@ -7,6 +7,10 @@ Rendering"): from support views that see the same surface, with more weight the 
 
 A field that reads images reproduces a support view better than any new view, because it reads that view itself. So its
 residual is computed with a penalty on it, as if it were as far away as support views are from a new one.
+
+After gradient steps, what a correction network adds to the mean residual may do harm, if the poses or the exposures of
+the views are not exact. So its share in the correction is then found by leave-one-out cross-validation on the support
+views.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from torch import Tensor
 from hyperplanes.adaptation.base import AdaptedField, Pictures, Renderable, attributes_of
 from hyperplanes.adaptation.correction_network import (
     DEPTH_OFFSETS,
+    MEAN_RESIDUAL,
     MIN_CORRECTED_OPACITY,
     CorrectionNetwork,
     covered,
@@ -46,6 +51,11 @@ __all__ = ["CorrectedField", "ResidualField", "are_corrected", "corrected_field"
 
 OWN_VIEW_ANGLE = 0.4  # radians that a support view counts as farther away when its own residual is computed
 MIN_CORRECTED_VIEWS = 3  # two gain 0.04 dB, one 0.01 (docs/image-based-measurements.md)
+MIN_CROSS_VALIDATED_VIEWS = 5
+LEFT_OUT_VIEWS = 8  # at most, one at a time
+# Gradient steps fit the support views, so their residuals are smaller than the errors of new views, and the best share
+# of the network for support views is below that for new ones (docs/image-based-measurements.md).
+SHARE_FACTOR, MIN_SHARE = 1.4, 0.5
 MAX_SUPPORT_PIXELS = 1 << 21  # of support views, such as 52 of 200x200, which take 20 s of two cores
 
 _rendering = ForkSafeLock()  # so that two threads that need the same support views render them once
@@ -57,7 +67,14 @@ class ResidualField:
     Support views near a new view are rendered on first use and kept, at 32 bytes a pixel.
     """
 
-    def __init__(self, uncorrected: Renderable, views: Views, network: CorrectionNetwork | None = None) -> None:
+    def __init__(
+        self,
+        uncorrected: Renderable,
+        views: Views,
+        network: CorrectionNetwork | None = None,
+        *,
+        cross_validated: bool = False,
+    ) -> None:
         """A field and its support views.
 
         Args:
@@ -65,6 +82,8 @@ class ResidualField:
             views: its support views, over the background that the field renders.
             network: which computes the correction from what the support views show; without it, the mean of their
                 residuals is added.
+            cross_validated: whether the correction is a mean of both, in which the network has the share that
+                `network_share` finds; for fields after gradient steps.
         """
         count, (height, width) = len(views), views.size
         needed = 4 * CHANNELS * count * height * width
@@ -72,10 +91,12 @@ class ResidualField:
         self.uncorrected = uncorrected
         self.views = views
         self.network = network
+        self.cross_validated = cross_validated and network is not None
         self._planes = ImagePlanes(
             views.images.new_zeros(count, CHANNELS, height, width), views.cameras, 0.0, exact=True
         )
         self._known: set[int] = set()  # views whose channels are computed
+        self._share: float | None = None
 
     def __repr__(self) -> str:
         return f"ResidualField({self.uncorrected!r}, {self.views!r})"
@@ -117,26 +138,72 @@ class ResidualField:
             cameras: as in `render`.
             view: index of the picture.
         """
+        return self._readings(pictures, cameras, view)
+
+    def _readings(
+        self, pictures: Pictures, cameras: PinholeCamera, view: int, without: int | None = None
+    ) -> Tensor | None:
+        """As `readings`, without one of the support views if its index is given."""
         seen, rays, depth = self._surface(pictures, cameras, view)
         points = torch.stack([rays.at(depth + self.views.bounds.radius * offset) for offset in DEPTH_OFFSETS])
-        found = self._reprojected(points, rays.directions)
+        found = self._reprojected(points, rays.directions, without)
         if found is None:
             return None
         image, opacity = pictures.images[view].to(depth), pictures.opacity[view, 0].to(depth)
-        return readings(image, opacity, seen, found, len(self.views))
+        return readings(image, opacity, seen, found, len(self.views) - (without is not None))
+
+    def network_share(self) -> float:
+        """The share of the network in the correction, the rest being the mean residual.
+
+        It is found by leave-one-out cross-validation: the residual of a support view is predicted from the other views,
+        for LEFT_OUT_VIEWS of them. The share with the least squared error is multiplied by SHARE_FACTOR, and limited to
+        MIN_SHARE to 1. Without cross-validation, and with fewer than MIN_CROSS_VALIDATED_VIEWS views, it is 1.
+        """
+        if not self.cross_validated or len(self.views) < MIN_CROSS_VALIDATED_VIEWS:
+            return 1.0
+        if self._share is None:
+            self._share = min(1.0, max(MIN_SHARE, SHARE_FACTOR * self._best_share()))
+        return self._share
+
+    @torch.no_grad()
+    def _best_share(self) -> float:
+        """The share of the network that predicts the residuals of support views from the other views best."""
+        assert self.network is not None
+        count = min(LEFT_OUT_VIEWS, len(self.views))
+        chosen = [place * (len(self.views) - 1) // (count - 1) for place in range(count)]
+        self._compute(chosen)
+        product = square = 0.0
+        for view in chosen:
+            maps = self._planes.images[[view]]
+            residual, moment, opacity, image = maps.split([3, 1, 1, 3], 1)
+            own = Pictures(image - residual, opacity, moment / opacity.clamp_min(1e-3), samples=0)
+            read = self._readings(own, camera.select(self._planes.cameras, [view]), 0, without=view)
+            if read is None:
+                continue
+            mean = read[MEAN_RESIDUAL]
+            change = self._network_output(read) - mean
+            product += float(((residual[0] - mean) * change).sum())
+            square += float(change.square().sum())
+        return product / square if square else 1.0
 
     def _added(self, pictures: Pictures, cameras: PinholeCamera, view: int) -> Float[Tensor, "3 height width"]:
         """What is added to the colours of a picture."""
         if self.network is not None:
-            read = self.readings(pictures, cameras, view)
-            weights = next(self.network.parameters())
-            return self.network(read[None].to(weights))[0] if read is not None else torch.zeros_like(pictures.images[0])
+            read = self._readings(pictures, cameras, view)
+            if read is None:
+                return torch.zeros_like(pictures.images[0])
+            return torch.lerp(read[MEAN_RESIDUAL], self._network_output(read), self.network_share())
         result = torch.zeros_like(pictures.images[view])
         seen, rays, depth = self._surface(pictures, cameras, view)
         found = self._reprojected(rays.at(depth)[None], rays.directions)
         if found is not None:
             result[:, seen] = found.residual[0].T.to(result) * covered(pictures.opacity[view, 0][seen])
         return result
+
+    def _network_output(self, read: Float[Tensor, "16 height width"]) -> Float[Tensor, "3 height width"]:
+        """What the network adds to a picture, from its inputs."""
+        assert self.network is not None
+        return self.network(read[None].to(next(self.network.parameters())))[0].to(read)
 
     def _surface(
         self, pictures: Pictures, cameras: PinholeCamera, view: int
@@ -161,17 +228,19 @@ class ResidualField:
             self._compute([view])
             if on_view is not None:
                 on_view(view + 1)
+        self.network_share()
 
     def _reprojected(
-        self, points: Float[Tensor, "depth pixel 3"], directions: Float[Tensor, "pixel 3"]
+        self, points: Float[Tensor, "depth pixel 3"], directions: Float[Tensor, "pixel 3"], without: int | None = None
     ) -> Reprojected | None:
         """What support views show at points seen along these directions; None if no view sees any of them.
 
         Args:
             points: one or several of each ray, the farthest last.
             directions: of the rays.
+            without: index of a support view that is left out.
         """
-        chosen, near = nearest_views(self._planes, points[-1], directions)
+        chosen, near = nearest_views(self._planes, points[-1], directions, without)
         if not near.any():
             return None
         self._compute(near.nonzero()[:, 0].tolist())
@@ -270,13 +339,17 @@ def are_corrected(network: HyperPlanesNetwork, support: Views) -> bool:
     return network.config.residuals and enough and len(support) * height * width <= MAX_SUPPORT_PIXELS
 
 
-def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support: Views) -> AdaptedField:
+def corrected_field(
+    network: HyperPlanesNetwork, adapted: AdaptedField, support: Views, *, cross_validated: bool = False
+) -> AdaptedField:
     """A field with residual correction if `are_corrected`.
 
     Args:
         network: the model.
         adapted: its field.
         support: the views of the object.
+        cross_validated: whether the share of the correction network is found by cross-validation, as it always is if
+            the model is configured so.
 
     Returns:
         A `CorrectedField`, or the field itself.
@@ -284,5 +357,6 @@ def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support:
     if not are_corrected(network, support):
         return adapted
     corrector = network.corrector if network.config.learned_correction else None
-    residuals = ResidualField(adapted, network.to_own(support), corrector)
+    cross_validated = cross_validated or network.config.cross_validated_correction
+    residuals = ResidualField(adapted, network.to_own(support), corrector, cross_validated=cross_validated)
     return CorrectedField(**attributes_of(adapted), uncorrected=adapted, residuals=residuals)
