@@ -30,6 +30,7 @@ from hyperplanes.fields.layers import has_mixed_precision
 from hyperplanes.geometry.symmetry.reflections import Plane, Symmetry
 from hyperplanes.hypernetwork import ImageHyperNetworkConfig
 from hyperplanes.training import Trainer, TrainingConfig
+from hyperplanes.training.correction import disturbed, recoloured
 from hyperplanes.utilities.images.metrics import psnr
 from hyperplanes.views import Task
 from tests.reference_rendering import Balls, small_model
@@ -461,6 +462,18 @@ def test_the_correction_network_raises_psnr_because_of_what_it_reads(monkeypatch
     forward = CorrectionNetwork.forward
     monkeypatch.setattr(CorrectionNetwork, "forward", lambda own, read: forward(own, of_other_pixels(read)))
     assert whole > score(network) + 1
+
+
+def test_cross_validation_raises_psnr_of_a_field_of_inexact_views_after_gradient_steps():
+    """Measured: 0.56 dB. The best share for support views is 0.91 if the views are exact, and -0.02 if not."""
+    generator, shares = torch.Generator().manual_seed(0), []
+    exact = few(shape(), 15)
+    for support in (exact, recoloured(disturbed(exact, 0.4, generator), 0.05, generator)):
+        field = pretrained("small").fine_tune(support, 15, FineTuning(rays=512))
+        shares.append(field.residuals.network_share())
+    assert shares[0] > shares[1] + 0.3
+    network_alone = ResidualField(field.without_residuals(), support, pretrained("small").corrector)
+    assert quality(field, shape(), 3) > quality(network_alone, shape(), 3) + 0.3
 
 
 def of_other_pixels(read):

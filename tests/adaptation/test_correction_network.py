@@ -8,16 +8,20 @@ import torch
 
 from hyperplanes.adaptation import CorrectedField, HyperPlanes, ResidualField, correction_network
 from hyperplanes.adaptation.base import AdaptedField
+from hyperplanes.adaptation.correction import residuals
+from hyperplanes.adaptation.correction.residuals import MIN_CROSS_VALIDATED_VIEWS, MIN_SHARE, SHARE_FACTOR
 from hyperplanes.adaptation.correction_network import (
     CANDIDATES,
     COLOUR,
     DEPTH_OFFSETS,
     DEVIATIONS,
+    MEAN_RESIDUAL,
     MIN_CORRECTED_OPACITY,
     OPACITY,
     READINGS,
     CorrectionNetwork,
 )
+from hyperplanes.configuration.fine_tuning import FineTuning
 from hyperplanes.geometry import cameras as camera
 from hyperplanes.geometry.occupancy import full
 from hyperplanes.geometry.rays import Sphere
@@ -128,6 +132,56 @@ def test_pictures_that_no_support_view_shows_stay(deep):
         assert torch.equal(residuals.correct(plain, cameras).images, plain.images.clamp(0, 1))
 
 
+class Multiplied(torch.nn.Module):
+    """A network whose output is `factor` times the mean residual."""
+
+    def __init__(self, factor):
+        super().__init__()
+        self.factor = torch.nn.Parameter(torch.tensor(factor))
+
+    def forward(self, read):
+        return self.factor * read[:, MEAN_RESIDUAL]
+
+
+@pytest.mark.parametrize("chosen", [Multiplied(4.0), Multiplied(3.2), Multiplied(2.0), Multiplied(6.0)])
+def test_the_share_of_a_network_is_the_best_for_support_views_that_are_left_out(monkeypatch, chosen):
+    """The others are corrected by a field of their own, which has never had the view that is left out."""
+    monkeypatch.setattr(residuals, "LEFT_OUT_VIEWS", 5)
+    field, support = striped(0.58, 0.2), views_of(striped(0.6), ring(14, SIZE))
+    product = square = 0.0
+    for view in (0, 3, 6, 9, 13):
+        others, own = [each for each in range(14) if each != view], support[[view]]
+        plain = field.render(own.cameras)
+        mean, found = (
+            ResidualField(field, support[others], network).correct(plain, own.cameras).images
+            for network in (None, chosen)
+        )
+        product += float(((own.images - mean) * (found - mean)).sum())
+        square += float((found - mean).square().sum())
+    expected = min(1.0, max(MIN_SHARE, SHARE_FACTOR * product / square))
+    cross_validated = ResidualField(field, support, chosen, cross_validated=True)
+    assert cross_validated.network_share() == pytest.approx(expected, abs=1e-3)
+    asked = camera_at((0.0, 0.5, 3.0), SIZE)
+    mean, alone, both = (
+        each.render(asked).images
+        for each in (ResidualField(field, support), ResidualField(field, support, chosen), cross_validated)
+    )
+    unclamped = (mean > 0) & (mean < 1) & (alone > 0) & (alone < 1)
+    torch.testing.assert_close(both[unclamped], torch.lerp(mean, alone, expected)[unclamped], atol=1e-3, rtol=0)
+
+
+def test_few_views_are_not_cross_validated_and_neither_is_a_mean_residual():
+    field, support = striped(0.58, 0.2), views_of(striped(0.6), ring(14, SIZE))[:MIN_CROSS_VALIDATED_VIEWS]
+    wrong = Multiplied(40.0)
+    assert ResidualField(field, support, wrong, cross_validated=True).network_share() == MIN_SHARE
+    for other in (
+        ResidualField(field, support[:-1], wrong, cross_validated=True),
+        ResidualField(field, support, wrong),
+        ResidualField(field, support, cross_validated=True),
+    ):
+        assert other.network_share() == 1
+
+
 @pytest.fixture(scope="module")
 def model():
     """A model whose correction network has random weights."""
@@ -162,9 +216,23 @@ def test_a_model_corrects_its_pictures_by_its_network(model, many, tmp_path):
     model.float()
 
 
+def test_a_fine_tuned_field_is_cross_validated_and_so_are_its_weights_alone(model):
+    many = ball_views(ring(14, (24, 24)))
+    fields = {steps: model.fine_tune(many, steps, FineTuning(rays=32)) for steps in (0, 2)}
+    for steps, field in fields.items():
+        assert field.residuals.cross_validated == (steps > 0)
+        alone = model.with_weights_of(field).adapt(many)
+        assert alone.residuals.cross_validated == (steps > 0)
+        assert alone.residuals.network_share() == pytest.approx(field.residuals.network_share(), abs=1e-4)
+    assert fields[2].residuals.network_share() < 1
+    assert not model.without_residuals().config.cross_validated_correction
+
+
 def test_a_correction_network_without_residuals_is_refused():
     with pytest.raises(ValueError, match="learned_correction: expected residuals"):
         HyperPlanes(replace(test_stacking.CONFIG, learned_correction=True))
+    with pytest.raises(ValueError, match="cross_validated_correction: expected a learned correction"):
+        HyperPlanes(replace(test_stacking.CONFIG, residuals=True, cross_validated_correction=True))
 
 
 def test_training_finds_which_candidate_is_right_and_where():
