@@ -472,7 +472,8 @@ def test_cross_validation_raises_psnr_of_a_field_of_inexact_views_after_gradient
         field = pretrained("small").fine_tune(support, 15, FineTuning(rays=512))
         shares.append(field.residuals.network_share())
     assert shares[0] > shares[1] + 0.3
-    network_alone = ResidualField(field.without_residuals(), support, pretrained("small").corrector)
+    plain = replace(field.without_residuals(), fine_tuned=False)
+    network_alone = ResidualField(plain, support, pretrained("small").corrector)
     assert quality(field, shape(), 3) > quality(network_alone, shape(), 3) + 0.3
 
 

@@ -84,6 +84,7 @@ class AdaptedField:
         densities: points -> density without colour, of the field and of its proposal.
         refined: the voxels of `occupancy` in which it has density, if known.
         symmetry: by which its views were reflected, if they were.
+        fine_tuned: whether gradient steps on its views made it.
     """
 
     field: FieldFunction
@@ -93,6 +94,7 @@ class AdaptedField:
     densities: tuple[Callable[[Tensor], Tensor], ...] = ()
     refined: RefinedOccupancy | None = None
     symmetry: Symmetry | None = None
+    fine_tuned: bool = False
 
     def __repr__(self) -> str:
         side = self.occupancy.occupied.shape[0]

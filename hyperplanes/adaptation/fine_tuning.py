@@ -124,7 +124,7 @@ def _fine_tune_in_frame(
     views = trained_on(context, placed.views)
 
     def finished(field: AdaptedField) -> AdaptedField:
-        return corrected_field(network, placed.in_scene(field), support, cross_validated=steps > 0)
+        return corrected_field(network, placed.in_scene(replace(field, fine_tuned=steps > 0)), support)
 
     try:
         tuned = fine_tune_to(network, context, steps, settings, views=views, schedule=schedule, on_step=on_step)

@@ -17,7 +17,7 @@ from hyperplanes.adaptation.alignment.rotation import RotatedField
 from hyperplanes.adaptation.base import AdaptedField, masks_problem
 from hyperplanes.adaptation.checkpoints import read_checkpoint, write_checkpoint
 from hyperplanes.adaptation.context import SupportContext
-from hyperplanes.adaptation.correction.residuals import CorrectedField, corrected_field
+from hyperplanes.adaptation.correction.residuals import corrected_field
 from hyperplanes.adaptation.correction.stacking import learned_part, stacked_field
 from hyperplanes.adaptation.fine_tuning import fine_tune
 from hyperplanes.adaptation.hub import upload_checkpoint
@@ -55,7 +55,7 @@ class HyperPlanes(HyperPlanesNetwork):
 
     def without_residuals(self) -> Self:
         """A model with the same weights without residual correction of its pictures (`correction.residuals`)."""
-        result = self._configured(residuals=False, learned_correction=False, cross_validated_correction=False)
+        result = self._configured(residuals=False, learned_correction=False)
         result.corrector = None
         return result
 
@@ -171,14 +171,13 @@ class HyperPlanes(HyperPlanesNetwork):
         Raises:
             ValueError: a field of another model.
         """
-        cross_validated = isinstance(adapted, CorrectedField) and adapted.residuals.cross_validated
         adapted = adapted.without_residuals()
         learned = learned_part(adapted)
         beside = {"hull_share": learned.share, "gated": learned.gate is not None, "average": learned.average}
         azimuth = -adapted.rotation.angle if isinstance(adapted, RotatedField) else 0.0
         beside |= {
             "learned_correction": self.config.learned_correction,
-            "cross_validated_correction": cross_validated,
+            "fine_tuned": adapted.fine_tuned,
             "symmetric": False,
             "symmetry": adapted.symmetry,
             "azimuth": azimuth,

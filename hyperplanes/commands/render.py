@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
     from hyperplanes.adaptation.base import Renderable
+    from hyperplanes.adaptation.correction_network import CorrectionNetwork
     from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.export.animation import Representation
-    from hyperplanes.export.baking import BakedScene
     from hyperplanes.rendering.images import Pictures
     from hyperplanes.views import Views
 
@@ -143,7 +143,8 @@ def run(arguments: Arguments) -> int:
     if isinstance(source, HyperPlanes) and (arguments.residuals == "off" or arguments.protocol != "default"):
         source = source.without_residuals()
     field, warned = adapt_to(source, shown, task.name, console, steps=arguments.steps, settings=settings)
-    field, corrected = _drawn(arguments, field, shown, asked, source, console)
+    network = source.corrector if isinstance(source, HyperPlanes) else None
+    field, corrected = _drawn(arguments, field, shown, asked, network, console)
     started = time.perf_counter()
     pictures = render_views(field, asked.cameras, console, PROTOCOLS[arguments.protocol])
     seconds = (time.perf_counter() - started) / asked.cameras.batch_size
@@ -177,7 +178,7 @@ def _drawn(
     field: Renderable,
     shown: Views,
     asked: Asked,
-    source: HyperPlanes | BakedScene,
+    network: CorrectionNetwork | None,
     console: Console,
 ) -> tuple[Renderable, bool]:
     """The field, or its voxels, with residuals if requested, and whether there are residuals.
@@ -186,17 +187,13 @@ def _drawn(
     """
     from hyperplanes.adaptation.base import AdaptedField
     from hyperplanes.adaptation.correction.residuals import CorrectedField, ResidualField
-    from hyperplanes.adaptation.hyperplanes import HyperPlanes
     from hyperplanes.export.animation import choose_representation
     from hyperplanes.export.voxel_fitting import VOXEL_STEPS
 
     make = partial(bake_field, fit=VOXEL_STEPS, console=console)
     field = choose_representation(field, shown, asked.cameras, _representation(arguments, asked), make=make)
     if arguments.residuals == "on" and not isinstance(field, CorrectedField):
-        network, tuned = None, False
-        if isinstance(source, HyperPlanes) and isinstance(field, AdaptedField):
-            network, tuned = source.corrector, bool(arguments.steps) or source.config.cross_validated_correction
-        field = ResidualField(field, shown, network, cross_validated=tuned)
+        field = ResidualField(field, shown, network if isinstance(field, AdaptedField) else None)
     residuals = field.residuals if isinstance(field, CorrectedField) else field
     if not isinstance(residuals, ResidualField):
         return field, False

@@ -39,8 +39,6 @@ def check_model(config: ModelConfig) -> type[Target]:
         raise ValueError(f"plane_dropout: expected a field with a fixed number of planes, got {config.target}")
     if config.learned_correction and not config.residuals:
         raise ValueError("learned_correction: expected residuals, which it is computed from, got none")
-    if config.cross_validated_correction and not config.learned_correction:
-        raise ValueError("cross_validated_correction: expected a learned correction, got none")
     for name in ("stacked", "hull_share", "gated", "average", "symmetric", "symmetry", "azimuth"):
         if getattr(config, name) and not target.permutation_invariant:
             raise ValueError(f"{name}: expected a field that takes any number of views, got {config.target}")

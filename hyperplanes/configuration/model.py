@@ -55,6 +55,8 @@ class ModelConfig:
             after gradient steps.
         average: share, in pictures, of the field before gradient steps, in a model that these made for one object
             (`stacking.average`).
+        fine_tuned: whether gradient steps made the model for one object; then the share of the correction network is
+            found by cross-validation (`correction.residuals.ResidualField.network_share`).
         learned_steps: steps of gradient descent by a network after the forward pass
             (`adaptation.optimisation.learned_steps`), half as many from twenty views on; `training.learned_step`
             trains it after the model.
@@ -62,8 +64,6 @@ class ModelConfig:
             the views (`adaptation.correction.residuals`).
         learned_correction: whether a network computes this correction (`adaptation.correction_network`);
             `training.correction` trains it after the model.
-        cross_validated_correction: whether its share in the correction is found by cross-validation on the support
-            views, in a model that gradient steps made for one object (`ResidualField.network_share`).
         symmetric: whether reflections of the views of an object that looks symmetric are added to its views
             (`adaptation.symmetry.detection`). Not used in training.
         symmetry: of the object, if it is known.
@@ -85,10 +85,10 @@ class ModelConfig:
     hull_share: float = 0.0
     gated: bool = False
     average: float = 0.0
+    fine_tuned: bool = False
     learned_steps: Annotated[int, range(33)] = 0
     residuals: bool = False
     learned_correction: bool = False
-    cross_validated_correction: bool = False
     symmetric: bool = False
     symmetry: Symmetry | None = None
     azimuth: float | None = None
@@ -127,8 +127,7 @@ class ModelConfig:
         """The model of its target alone, without a network that finds weights and without averaged pictures."""
         alone = replace(self, hypernetwork=None, autoencoder=None, initialisation=None)
         averaging = {"stacked": False, "hull_share": 0.0, "gated": False, "average": 0.0}
-        correction = {"learned_correction": False, "cross_validated_correction": False}
-        return replace(alone, **averaging, **correction, learned_steps=0)
+        return replace(alone, **averaging, learned_steps=0, learned_correction=False, fine_tuned=False)
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object from which `of_json` makes the same configuration."""

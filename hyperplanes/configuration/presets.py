@@ -108,8 +108,7 @@ class Preset:
     def for_known_places(self) -> Preset:
         """The preset without settings that only a field of any number of views supports."""
         alone = {"stacked": False, "gated": False, "learned_steps": 0, "hull_share": 0.0, "symmetric": False}
-        uncorrected = {"residuals": False, "learned_correction": False, "cross_validated_correction": False}
-        model = replace(self.model, **alone, **uncorrected, symmetry=None, azimuth=None)
+        model = replace(self.model, **alone, residuals=False, learned_correction=False, symmetry=None, azimuth=None)
         return replace(self, model=model, training=replace(_of_all_views(self.training), volume_loss=0.0))
 
     def without_hypernetwork(self) -> Preset:

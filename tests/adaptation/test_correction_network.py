@@ -1,6 +1,7 @@
 """Sources of truth: a textured ball whose depth is known, and examples in which it is known what has to be added."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 
 import pytest
@@ -15,7 +16,7 @@ from hyperplanes.adaptation.correction_network import (
     COLOUR,
     DEPTH_OFFSETS,
     DEVIATIONS,
-    MEAN_RESIDUAL,
+    INITIAL_WEIGHTS,
     MIN_CORRECTED_OPACITY,
     OPACITY,
     READINGS,
@@ -132,58 +133,53 @@ def test_pictures_that_no_support_view_shows_stay(deep):
         assert torch.equal(residuals.correct(plain, cameras).images, plain.images.clamp(0, 1))
 
 
-class Multiplied(torch.nn.Module):
+def multiplied(factor):
     """A network whose output is `factor` times the mean residual."""
-
-    def __init__(self, factor):
-        super().__init__()
-        self.factor = torch.nn.Parameter(torch.tensor(factor))
-
-    def forward(self, read):
-        return self.factor * read[:, MEAN_RESIDUAL]
+    network = CorrectionNetwork()
+    network.last[1].bias[:2] = torch.tensor([factor, -INITIAL_WEIGHTS[1]])
+    return network
 
 
 @pytest.fixture(scope="module")
 def around():
-    """A striped ball that is too small, and views of the right one from all around."""
-    return striped(0.58, 0.2), views_of(striped(0.6), ring(14, (32, 32)))
+    """A fine-tuned field, a striped ball that is too small, and views of the right one from all around."""
+    return replace(striped(0.58, 0.2), fine_tuned=True), views_of(striped(0.6), ring(14, (32, 32)))
 
 
-@pytest.mark.parametrize("chosen", [Multiplied(4.0), Multiplied(5.0), Multiplied(2.0), Multiplied(10.0)])
-def test_the_share_of_a_network_is_the_best_for_support_views_that_are_left_out(around, monkeypatch, chosen):
+@pytest.mark.parametrize(("count", "factor"), [(14, 4.0), (14, 5.0), (14, 2.0), (14, 10.0), (6, 4.0), (6, 5.0)])
+def test_the_share_of_a_network_is_the_best_for_support_views_that_are_left_out(around, monkeypatch, count, factor):
     """The others are corrected by a field of their own, which has never had the view that is left out."""
     monkeypatch.setattr(residuals, "LEFT_OUT_VIEWS", 5)
-    field, support = around
-    product = square = 0.0
-    for view in (0, 3, 6, 9, 13):
-        others, own = [each for each in range(14) if each != view], support[[view]]
+    field, support, chosen = around[0], around[1][:count], multiplied(factor)
+    cross_validated, product, square = ResidualField(field, support, chosen), 0.0, 0.0
+    for view in {14: (0, 3, 6, 9, 13), 6: (0, 1, 2, 3, 5)}[count]:
+        others, own = support[[each for each in range(count) if each != view]], support[[view]]
         plain = field.render(own.cameras)
-        mean, found = (
-            ResidualField(field, support[others], network).correct(plain, own.cameras).images
-            for network in (None, chosen)
-        )
+        corrections = ResidualField(field, others), ResidualField(replace(field, fine_tuned=False), others, chosen)
+        mean, found = (each.correct(plain, own.cameras).images for each in corrections)
         product += float(((own.images - mean) * (found - mean)).sum())
         square += float((found - mean).square().sum())
+        read = cross_validated._readings(plain, own.cameras, 0, without=view)
+        torch.testing.assert_close(read, corrections[0].readings(plain, own.cameras, 0))
     expected = min(1.0, max(MIN_SHARE, SHARE_FACTOR * product / square))
-    cross_validated = ResidualField(field, support, chosen, cross_validated=True)
-    assert cross_validated.network_share() == pytest.approx(expected, abs=1e-3)
+    assert cross_validated.network_share() == pytest.approx(expected, abs=2e-3)
     asked = camera_at((0.0, 0.5, 3.0), (32, 32))
+    of_forward_pass = ResidualField(replace(field, fine_tuned=False), support, chosen)
     mean, alone, both = (
-        each.render(asked).images
-        for each in (ResidualField(field, support), ResidualField(field, support, chosen), cross_validated)
+        each.render(asked).images for each in (ResidualField(field, support), of_forward_pass, cross_validated)
     )
     unclamped = (mean > 0) & (mean < 1) & (alone > 0) & (alone < 1)
-    torch.testing.assert_close(both[unclamped], torch.lerp(mean, alone, expected)[unclamped], atol=1e-3, rtol=0)
+    torch.testing.assert_close(both[unclamped], torch.lerp(mean, alone, expected)[unclamped], atol=2e-3, rtol=0)
 
 
-def test_few_views_are_not_cross_validated_and_neither_is_a_mean_residual(around):
+def test_few_views_are_not_cross_validated_and_neither_are_other_fields(around):
     field, support = around[0], around[1][:MIN_CROSS_VALIDATED_VIEWS]
-    wrong = Multiplied(40.0)
-    assert ResidualField(field, support, wrong, cross_validated=True).network_share() == MIN_SHARE
+    wrong = multiplied(40.0)
+    assert ResidualField(field, support, wrong).network_share() == MIN_SHARE
     for other in (
-        ResidualField(field, support[:-1], wrong, cross_validated=True),
-        ResidualField(field, support, wrong),
-        ResidualField(field, support, cross_validated=True),
+        ResidualField(field, support[:-1], wrong),
+        ResidualField(replace(field, fine_tuned=False), support, wrong),
+        ResidualField(field, support),
     ):
         assert other.network_share() == 1
 
@@ -222,23 +218,28 @@ def test_a_model_corrects_its_pictures_by_its_network(model, many, tmp_path):
     model.float()
 
 
-def test_a_fine_tuned_field_is_cross_validated_and_so_are_its_weights_alone(model):
-    many = ball_views(ring(14, (24, 24)))
-    fields = {steps: model.fine_tune(many, steps, FineTuning(rays=32)) for steps in (0, 2)}
-    for steps, field in fields.items():
-        assert field.residuals.cross_validated == (steps > 0)
-        alone = model.with_weights_of(field).adapt(many)
-        assert alone.residuals.cross_validated == (steps > 0)
-        assert alone.residuals.network_share() == pytest.approx(field.residuals.network_share(), abs=1e-4)
-    assert fields[2].residuals.network_share() < 1
-    assert not model.without_residuals().config.cross_validated_correction
+def test_a_fine_tuned_field_is_cross_validated_and_so_are_its_weights_alone(model, tmp_path):
+    many, settings, model = ball_views(ring(14, (24, 24))), FineTuning(rays=32), deepcopy(model)
+    model.corrector = multiplied(16.0)
+    tuned = model.fine_tune(many, 2, settings)
+    share = tuned.residuals.network_share()
+    assert MIN_SHARE < share < 1
+    model.with_weights_of(tuned).save(tmp_path)
+    alone = HyperPlanes.from_pretrained(tmp_path)
+    assert alone.adapt(many).residuals.network_share() == pytest.approx(share, abs=1e-3)
+    assert alone.with_weights_of(alone.adapt(many)).config.fine_tuned
+    unchanged = model.fine_tune(many, 0, settings)
+    assert unchanged.residuals.network_share() == 1
+    assert not model.with_weights_of(unchanged).config.fine_tuned
+    # also where pictures are not corrected, as those of large views
+    uncorrected = model.without_residuals()
+    assert uncorrected.with_weights_of(uncorrected.fine_tune(many, 2, settings)).config.fine_tuned
+    assert uncorrected.with_weights_of(tuned).config.fine_tuned
 
 
 def test_a_correction_network_without_residuals_is_refused():
     with pytest.raises(ValueError, match="learned_correction: expected residuals"):
         HyperPlanes(replace(test_stacking.CONFIG, learned_correction=True))
-    with pytest.raises(ValueError, match="cross_validated_correction: expected a learned correction"):
-        HyperPlanes(replace(test_stacking.CONFIG, residuals=True, cross_validated_correction=True))
 
 
 def test_training_finds_which_candidate_is_right_and_where():

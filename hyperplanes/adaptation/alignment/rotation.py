@@ -63,6 +63,7 @@ class Rotation:
             self._occupancy(field.occupancy),
             field.sampling,
             symmetry=self.symmetry(field.symmetry, bounds),
+            fine_tuned=field.fine_tuned,
             unrotated=field,
             rotation=self,
         )

@@ -8,9 +8,9 @@ Rendering"): from support views that see the same surface, with more weight the 
 A field that reads images reproduces a support view better than any new view, because it reads that view itself. So its
 residual is computed with a penalty on it, as if it were as far away as support views are from a new one.
 
-After gradient steps, what a correction network adds to the mean residual may do harm, if the poses or the exposures of
-the views are not exact. So its share in the correction is then found by leave-one-out cross-validation on the support
-views.
+After gradient steps, a mean of what a correction network finds and of the mean residual is often better than either,
+above all if the poses or the exposures of the views are not exact. The share of the network in it is found by
+leave-one-out cross-validation on the support views.
 """
 
 from __future__ import annotations
@@ -64,26 +64,18 @@ _rendering = ForkSafeLock()  # so that two threads that need the same support vi
 class ResidualField:
     """A field with residual correction of its pictures; opacity and depth stay those of the field.
 
-    Support views near a new view are rendered on first use and kept, at 32 bytes a pixel.
+    Support views near a new view are rendered on first use and kept, at 32 bytes a pixel. For a fine-tuned field with a
+    correction network they are up to eight all around (`network_share`) and those near them.
     """
 
-    def __init__(
-        self,
-        uncorrected: Renderable,
-        views: Views,
-        network: CorrectionNetwork | None = None,
-        *,
-        cross_validated: bool = False,
-    ) -> None:
+    def __init__(self, uncorrected: Renderable, views: Views, network: CorrectionNetwork | None = None) -> None:
         """A field and its support views.
 
         Args:
             uncorrected: the field.
             views: its support views, over the background that the field renders.
             network: which computes the correction from what the support views show; without it, the mean of their
-                residuals is added.
-            cross_validated: whether the correction is a mean of both, in which the network has the share that
-                `network_share` finds; for fields after gradient steps.
+                residuals is added. After gradient steps, a mean of both is added (`network_share`).
         """
         count, (height, width) = len(views), views.size
         needed = 4 * CHANNELS * count * height * width
@@ -91,7 +83,6 @@ class ResidualField:
         self.uncorrected = uncorrected
         self.views = views
         self.network = network
-        self.cross_validated = cross_validated and network is not None
         self._planes = ImagePlanes(
             views.images.new_zeros(count, CHANNELS, height, width), views.cameras, 0.0, exact=True
         )
@@ -152,14 +143,16 @@ class ResidualField:
         image, opacity = pictures.images[view].to(depth), pictures.opacity[view, 0].to(depth)
         return readings(image, opacity, seen, found, len(self.views) - (without is not None))
 
+    @without_autocast
     def network_share(self) -> float:
-        """The share of the network in the correction, the rest being the mean residual.
+        """The share of the network in the correction of a fine-tuned field, the rest being the mean residual.
 
         It is found by leave-one-out cross-validation: the residual of a support view is predicted from the other views,
-        for LEFT_OUT_VIEWS of them. The share with the least squared error is multiplied by SHARE_FACTOR, and limited to
-        MIN_SHARE to 1. Without cross-validation, and with fewer than MIN_CROSS_VALIDATED_VIEWS views, it is 1.
+        for up to LEFT_OUT_VIEWS of them. The share with the least squared error is multiplied by SHARE_FACTOR, and
+        limited to MIN_SHARE to 1. For other fields, and with fewer than MIN_CROSS_VALIDATED_VIEWS views, it is 1.
         """
-        if not self.cross_validated or len(self.views) < MIN_CROSS_VALIDATED_VIEWS:
+        fine_tuned = isinstance(self.uncorrected, AdaptedField) and self.uncorrected.fine_tuned
+        if self.network is None or not fine_tuned or len(self.views) < MIN_CROSS_VALIDATED_VIEWS:
             return 1.0
         if self._share is None:
             self._share = min(1.0, max(MIN_SHARE, SHARE_FACTOR * self._best_share()))
@@ -184,7 +177,7 @@ class ResidualField:
             change = self._network_output(read) - mean
             product += float(((residual[0] - mean) * change).sum())
             square += float(change.square().sum())
-        return product / square if square else 1.0
+        return product / square if square > 0 else 1.0
 
     def _added(self, pictures: Pictures, cameras: PinholeCamera, view: int) -> Float[Tensor, "3 height width"]:
         """What is added to the colours of a picture."""
@@ -339,24 +332,21 @@ def are_corrected(network: HyperPlanesNetwork, support: Views) -> bool:
     return network.config.residuals and enough and len(support) * height * width <= MAX_SUPPORT_PIXELS
 
 
-def corrected_field(
-    network: HyperPlanesNetwork, adapted: AdaptedField, support: Views, *, cross_validated: bool = False
-) -> AdaptedField:
+def corrected_field(network: HyperPlanesNetwork, adapted: AdaptedField, support: Views) -> AdaptedField:
     """A field with residual correction if `are_corrected`.
 
     Args:
         network: the model.
         adapted: its field.
         support: the views of the object.
-        cross_validated: whether the share of the correction network is found by cross-validation, as it always is if
-            the model is configured so.
 
     Returns:
         A `CorrectedField`, or the field itself.
     """
+    if network.config.fine_tuned:
+        adapted = replace(adapted, fine_tuned=True)
     if not are_corrected(network, support):
         return adapted
     corrector = network.corrector if network.config.learned_correction else None
-    cross_validated = cross_validated or network.config.cross_validated_correction
-    residuals = ResidualField(adapted, network.to_own(support), corrector, cross_validated=cross_validated)
+    residuals = ResidualField(adapted, network.to_own(support), corrector)
     return CorrectedField(**attributes_of(adapted), uncorrected=adapted, residuals=residuals)
