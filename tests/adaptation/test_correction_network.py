@@ -159,7 +159,7 @@ def test_the_share_of_a_network_is_the_best_for_support_views_that_are_left_out(
         mean, found = (each.correct(plain, own.cameras).images for each in corrections)
         product += float(((own.images - mean) * (found - mean)).sum())
         square += float((found - mean).square().sum())
-        read = cross_validated._readings(plain, own.cameras, 0, without=view)
+        read = cross_validated.readings(plain, own.cameras, 0, without=view)
         torch.testing.assert_close(read, corrections[0].readings(plain, own.cameras, 0))
     expected = min(1.0, max(MIN_SHARE, SHARE_FACTOR * product / square))
     assert cross_validated.network_share() == pytest.approx(expected, abs=2e-3)

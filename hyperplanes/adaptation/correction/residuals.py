@@ -51,7 +51,7 @@ __all__ = ["CorrectedField", "ResidualField", "are_corrected", "corrected_field"
 
 OWN_VIEW_ANGLE = 0.4  # radians that a support view counts as farther away when its own residual is computed
 MIN_CORRECTED_VIEWS = 3  # two gain 0.04 dB, one 0.01 (docs/image-based-measurements.md)
-MIN_CROSS_VALIDATED_VIEWS = 5
+MIN_CROSS_VALIDATED_VIEWS = 5  # not measured with four; of three that are far apart none shows what another one does
 LEFT_OUT_VIEWS = 8  # at most, one at a time
 # Gradient steps fit the support views, so their residuals are smaller than the errors of new views, and the best share
 # of the network for support views is below that for new ones (docs/image-based-measurements.md).
@@ -120,7 +120,7 @@ class ResidualField:
 
     @torch.no_grad()
     def readings(
-        self, pictures: Pictures, cameras: PinholeCamera, view: int
+        self, pictures: Pictures, cameras: PinholeCamera, view: int, without: int | None = None
     ) -> Float[Tensor, "16 height width"] | None:
         """The inputs of a correction network for one of these pictures; None if it shows nothing of the scene.
 
@@ -128,13 +128,8 @@ class ResidualField:
             pictures: of the field, one a camera.
             cameras: as in `render`.
             view: index of the picture.
+            without: index of a support view that is left out.
         """
-        return self._readings(pictures, cameras, view)
-
-    def _readings(
-        self, pictures: Pictures, cameras: PinholeCamera, view: int, without: int | None = None
-    ) -> Tensor | None:
-        """As `readings`, without one of the support views if its index is given."""
         seen, rays, depth = self._surface(pictures, cameras, view)
         points = torch.stack([rays.at(depth + self.views.bounds.radius * offset) for offset in DEPTH_OFFSETS])
         found = self._reprojected(points, rays.directions, without)
@@ -170,7 +165,7 @@ class ResidualField:
             maps = self._planes.images[[view]]
             residual, moment, opacity, image = maps.split([3, 1, 1, 3], 1)
             own = Pictures(image - residual, opacity, moment / opacity.clamp_min(1e-3), samples=0)
-            read = self._readings(own, camera.select(self._planes.cameras, [view]), 0, without=view)
+            read = self.readings(own, camera.select(self._planes.cameras, [view]), 0, without=view)
             if read is None:
                 continue
             mean = read[MEAN_RESIDUAL]
@@ -182,7 +177,7 @@ class ResidualField:
     def _added(self, pictures: Pictures, cameras: PinholeCamera, view: int) -> Float[Tensor, "3 height width"]:
         """What is added to the colours of a picture."""
         if self.network is not None:
-            read = self._readings(pictures, cameras, view)
+            read = self.readings(pictures, cameras, view)
             if read is None:
                 return torch.zeros_like(pictures.images[0])
             return torch.lerp(read[MEAN_RESIDUAL], self._network_output(read), self.network_share())
@@ -212,7 +207,7 @@ class ResidualField:
 
     @torch.no_grad()
     def prepare(self, on_view: Callable[[int], None] | None = None) -> None:
-        """Render all support views now, instead of on first use.
+        """Render all support views now, instead of on first use, and find the share of the network.
 
         Args:
             on_view: called with the number of views done.
